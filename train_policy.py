@@ -130,8 +130,8 @@ class TrainPolicyConfig:
     resume: bool = False
     """Continue the run in `out`, or start it if the folder holds none."""
     selections: int = 8
-    """Number of times, evenly spread, that the policy is measured for model selection; once more at the end, where the
-    last rollout goes beyond `steps`."""
+    """Number of times that the policy is measured for model selection, evenly spread as far as its updates allow: a
+    measurement comes after an update, and the last one after the last."""
     selection_episodes: int | None = None
     """Number of episodes per such measurement, on seeds that neither training nor the final table uses. None takes 20,
     in mpe2's particle worlds 100."""

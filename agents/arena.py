@@ -6,6 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
+import torch
 from jaxtyping import Bool
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -198,7 +199,8 @@ class MultiagentArena:
         if self._venv is None or len(self._venv.envs) < count:
             if self._venv is not None:
                 self._venv.close()
-            venv = make_multiagent_venv(self._task, count).venv
+            with torch.random.fork_rng(devices=[]):  # loading a forecaster draws, which a training must not notice
+                venv = make_multiagent_venv(self._task, count).venv
             assert isinstance(venv, ParallelVecEnv)
             self._venv = venv
         return self._venv

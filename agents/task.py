@@ -189,7 +189,10 @@ class Task:
             options["horizon_steps"] = sized.horizon_steps
         name = "forecast" if self.observe == CONSTANT_VELOCITY else self.observe
         layout = None if sized is None else EntryLayout.of(sized)
-        bank = _bank_of(replace(self, observe="forecast")) if self.observe == "shuffled" else None
+        bank = None
+        if self.observe == "shuffled":
+            sizes = self.sizes_of or entry_for(self.env_id).checkpoint
+            bank = _bank_of(replace(self, observe="forecast", sizes_of=sizes))
         return options | {"arm": Arm(name, layout, bank)}
 
     def wrapped(self, env: Any) -> Any:

@@ -58,8 +58,8 @@ class TrainingPlan:
     device: str = "cpu"
     """Device that runs the policy's network: cpu, cuda or auto."""
     selections: int = 8
-    """Number of times, evenly spread, that the policy is measured on the selection seeds; once more at the end, where
-    the last rollout goes beyond `steps`."""
+    """Number of times that the policy is measured on the selection seeds, evenly spread as far as its updates allow: a
+    measurement comes after an update, and the last one after the last."""
     selection_episodes: int = 20
     """Number of episodes per measurement; all measurements use the same seeds."""
     selection_envs: int = 2
@@ -70,7 +70,7 @@ class TrainingPlan:
     """Whether all environments run in the process that trains, for several trainings side by side."""
     repeatable: bool = False
     """Whether a run that was stopped and resumed equals one that was not: environments and random streams then start
-    anew at every checkpoint."""
+    anew at every checkpoint. Episodes end there, so `checkpoint_every / num_envs` should be well above their length."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Hyperparameters in place of the preset's."""
     shaping: bool = True
@@ -171,7 +171,7 @@ def _learn(
         return {"seconds": select.seconds, "loop_errors": errors.sums()}
 
     save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, extra, restart)
-    callbacks = [CountSteps(plan.num_envs), errors, save, select, *([progress] if progress_bar else [])]
+    callbacks = [CountSteps(plan.num_envs), errors, select, save, *([progress] if progress_bar else [])]
     try:
         model.learn(
             plan.steps - model.num_timesteps,
@@ -272,11 +272,14 @@ class SelectBest(BaseCallback):
     therefore replaces the kept one unless it is `significantly_worse` than the model with the highest mean so far.
     Comparing with that one, not with the kept one, prevents that small losses add up.
 
+    Measurements are made between updates and at the end, so that what has been collected has also been learned from.
+    They come before `SaveCheckpoint`, whose file then has them.
+
     Args:
         arena: arena that plays the same seeds at each measurement.
         path: path of the selected model, written atomically.
         num_episodes: number of episodes per measurement.
-        every_steps: number of environment steps between measurements; there is always one at the end.
+        every_steps: least number of environment steps between measurements; there is always one at the end.
         note: what the policy needs beside its weights.
         curve: path of a JSON file with a line per measurement, written atomically; None writes none.
         at_multiples: whether to measure at the multiples of `every_steps`, wherever the training was resumed.
@@ -321,22 +324,25 @@ class SelectBest(BaseCallback):
 
     def _on_training_start(self) -> None:
         """Continues from the results inside an existing file."""
-        self._measured_at = self.model.num_timesteps
+        self._measured_at = begun = self.model.num_timesteps
         try:
             self._highest = list(read_note(self._path).get("highest_returns", []))
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
         if self._curve is not None:
-            self._points = [p for p in read_curve(self._curve) if p["steps"] <= self._measured_at]
+            self._points = [p for p in read_curve(self._curve) if p["steps"] <= begun]
+            self._measured_at = self._points[-1]["steps"] if self._points else 0
         self._since = time.perf_counter()
 
-    def _on_step(self) -> bool:
+    def _on_rollout_start(self) -> None:
         if self._at_multiples:
             due = self.num_timesteps // self._every > self._measured_at // self._every
         else:
             due = self.num_timesteps - self._measured_at >= self._every
         if due:
             self._measure()
+
+    def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:

@@ -41,7 +41,7 @@ from predictor.support.provenance import provenance
 
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
-MEASURING = 3
+MEASURING = 4
 """Number of the way of running and measuring, networks included; a cell of another one is another cell."""
 NETWORK = 2
 """Number of the network that reads forecasts (`agents.features`); a cell of a policy with another one is another

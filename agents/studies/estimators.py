@@ -80,10 +80,11 @@ def bootstrapped(
         resamples: number of draws.
 
     Returns:
-        The estimate; without an interval if no scenario of any sample has two runs.
+        The estimate; without an interval if a scenario of a sample has less than two runs, which say nothing of how
+        much runs differ.
     """
     value = float(statistic(*samples))
-    if all(len(scores) < 2 for runs in samples for scores in runs):
+    if any(len(scores) < 2 for runs in samples for scores in runs):
         return Estimate(value, np.nan, np.nan)
     drawn = [statistic(*([_redrawn(s, generator) for s in runs] for runs in samples)) for _ in range(resamples)]
     low, high = np.nanpercentile(drawn, [50 - 50 * CONFIDENCE, 50 + 50 * CONFIDENCE])

@@ -106,11 +106,13 @@ class Study:
     episodes: int = 200
     """Number of test episodes of each policy and driver; all play the same seeds."""
     selections: int = 8
-    """Number of times in a training that the policy is measured on the selection seeds, a point of the curve each."""
+    """Number of times in a training that the policy is measured on the selection seeds, a point of the curve each; at
+    most once after each update."""
     selection_episodes: int = 20
     """Number of episodes of each such measurement."""
     checkpoint_every: int = 2_000
-    """Number of environment steps between checkpoints, from which a killed training goes on."""
+    """Number of environment steps between checkpoints, from which a killed training goes on. Episodes end there, so
+    `checkpoint_every / num_envs` should be well above their length."""
     references: tuple[str, ...] = REFERENCES
     """Drivers that are measured without training, where a scenario names none of its own."""
     rivals: tuple[str, ...] | None = None
@@ -139,6 +141,8 @@ class Study:
                 raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")
         for key, name in (("floor", self.floor), ("ceiling", self.ceiling)):
             self._arm_called(name, key)
+        if self.floor == self.ceiling:
+            raise UserError(f"floor and ceiling must be two arms, got '{self.floor}' for both")
 
     @property
     def training_seeds(self) -> tuple[int, ...]:
@@ -315,7 +319,10 @@ def _task_options(table: Mapping[str, Any], where: str, others: Sequence[str] = 
             raise UserError(f"{where}: unknown key '{key}'; there are {', '.join((*others, *known))}")
     texts = dict(table)
     if isinstance(texts.get("env_kwargs"), dict):
-        texts["env_kwargs"] = json.dumps(texts["env_kwargs"])
+        try:
+            texts["env_kwargs"] = json.dumps(texts["env_kwargs"])
+        except TypeError as error:
+            raise UserError(f"{where}: env_kwargs must hold what JSON has (no dates or times): {error}") from error
     return {key: converted(value, hints[key], f"{where}: {key}") for key, value in texts.items()}
 
 

@@ -124,6 +124,19 @@ def test_every_arm_has_the_same_space(env_id: str):
     assert all(space == spaces[0] for space in spaces)
 
 
+def test_another_scenes_forecasts_have_the_sizes_of_the_other_arms(tmp_path: Path):
+    """The checkpoint forecasts fewer steps than the one that ships, by which the observation is laid out."""
+    short = save_tiny(tmp_path / "short", HIGHWAY_SPEC)
+    found = {}
+    for arm in ("single", "shuffled"):
+        env = Task("highway-fast-v0", arm, short).wrapped(Task("highway-fast-v0", arm, short).make())
+        observations = [env.reset(seed=seed)[0]["forecast"] for seed in range(6)]
+        found[arm] = np.abs(np.stack(observations)).max(axis=(0, 1, 3))
+        env.close()
+    assert found["single"].shape == found["shuffled"].shape
+    assert found["single"].min() > 0 and found["shuffled"].min() > 0
+
+
 def test_every_arm_has_the_sizes_of_the_checkpoint_that_is_named(tmp_path: Path):
     """Also arms with forecasters of other sizes: fewer edges, fewer steps."""
     spec = replace(HIGHWAY_SPEC, max_agents=4, perception_m=50.0)

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -106,6 +107,33 @@ def test_every_selection_plays_the_same_seeds(
 def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], EgoArena], tmp_path: Path):
     make_ppo().learn(24, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=1000))
     assert read_note(tmp_path / "best.zip")["steps"] == 24
+
+
+@pytest.mark.parametrize("every_steps", [2, 8])
+def test_each_measurement_is_of_a_model_that_has_learned_from_all_that_it_collected(every_steps: int, tmp_path: Path):
+    """The last one, too, and none is of a model that was measured already."""
+    model, arena, updates = make_ppo(), Scripted([0.0], [0.0], [0.0]), list[int]()
+    play = arena.play
+    arena.play = lambda policy, seeds, _=None: updates.append(policy._n_updates) or play(policy, seeds)  # type: ignore[method-assign]
+    curve = tmp_path / "curve.json"
+    model.learn(24, callback=SelectBest(arena, tmp_path / "best.zip", 1, every_steps=every_steps, curve=curve))
+    assert updates == [1, 2, 3] and [point["steps"] for point in read_curve(curve)] == [8, 16, 24]
+    kept = PPO.load(tmp_path / "best.zip", device="cpu")
+    for name, weights in model.policy.state_dict().items():
+        assert torch.equal(weights, kept.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(("measured_at", "every", "expected"), [([8], 24, [8, 32, 48]), ([], 16, [16, 32, 48])])
+def test_measurements_go_on_from_the_last_one_not_from_the_checkpoint(
+    measured_at: list[int], every: int, expected: list[int], tmp_path: Path
+):
+    """Resumed at step 16."""
+    model, curve = make_ppo(), tmp_path / "curve.json"
+    model.learn(16)
+    curve.write_text(json.dumps([{"steps": step, "return": 0.0} for step in measured_at]))
+    select = SelectBest(Scripted(*[[0.0]] * 3), tmp_path / "best.zip", 1, every_steps=every, curve=curve)
+    model.learn(32, reset_num_timesteps=False, callback=select)
+    assert [point["steps"] for point in read_curve(curve)] == expected
 
 
 class Scripted:
@@ -303,6 +331,7 @@ def dies_after(calls: int, kind: type, method: str, monkeypatch: pytest.MonkeyPa
     ("algorithm", "task", "preset"),
     [
         ("ppo", CONSTANT_VELOCITY, PPOPreset(n_steps=8, batch_size=8, n_epochs=2, net_arch=(8,))),
+        ("ppo", Task("simple_spread_v3", "zeros"), PPOPreset(n_steps=8, batch_size=8, n_epochs=2, net_arch=(8,))),
         ("dqn", Task(TOY, "none"), DQNPreset(learning_starts=8, batch_size=4, net_arch=(8,))),
         ("a2c", Task(TOY, "none"), A2CPreset(n_steps=4, net_arch=(8,))),
         ("sac", Task(STEERING, "none"), SACPreset(learning_starts=8, batch_size=4, net_arch=(8,))),

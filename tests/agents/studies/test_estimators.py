@@ -1,4 +1,5 @@
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,6 +112,12 @@ def test_the_bootstrap_of_many_runs_is_the_normal_interval():
 
 def test_a_single_run_has_no_interval():
     assert not bootstrapped(mean, runs([1], [2]), generator=np.random.default_rng(0)).has_interval
+
+
+@pytest.mark.parametrize("samples", [(runs([1, 2, 3]), runs([2])), (runs([1, 2], [3]), runs([1, 2], [3, 4]))])
+def test_beside_a_single_run_nothing_has_an_interval(samples: tuple[Any, Any]):
+    """How much runs differ is not known of it."""
+    assert not bootstrapped(gain, *samples, generator=np.random.default_rng(0)).has_interval
 
 
 def test_the_share_of_headroom():

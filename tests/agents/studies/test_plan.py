@@ -121,6 +121,11 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
         (study_text(rivals='["zeroes"]'), "corridor.toml: rivals names 'zeroes', which is no arm; there are none"),
         (study_text(floor='"zeroes"'), "corridor.toml: floor must be an arm of the study or one of forecast.*'zeroes'"),
         (study_text(ceiling='"orcale"'), "corridor.toml: ceiling must be an arm of the study or one of .*'orcale'"),
+        (study_text(floor='"zeros"', ceiling='"zeros"'), "floor and ceiling must be two arms, got 'zeros'"),
+        (
+            study_text() + "env_kwargs = {since = 2020-01-01}\n",
+            r"corridor.toml: scenarios.corridor: env_kwargs must hold what JSON has \(no dates or times\): .* date",
+        ),
         (study_text() + "backend = 3\n", "corridor.toml: scenarios.corridor: backend must be one of gymnasium"),
         (study_text() + "arm = 3\n", "corridor.toml: scenarios.corridor: unknown key 'arm'; there are env_id, steps"),
         (study_text() + "num_envs = 0\n", "corridor.toml: scenarios.corridor: num_envs must be at least 1, got 0"),
