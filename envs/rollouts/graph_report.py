@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from rich.console import Group
 from rich.table import Table
 
-from envs.rollouts.graph_run import AHEAD, DISTANCE, LEADERS, MAJORITY, EnvGraph
+from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import BLACK, GREY, STYLE, YELLOW, looks_of
@@ -24,7 +24,7 @@ HEADS = (
     "AUC (95 %)", "average precision", "calibration error", "r with shift (95 %)", "spread over senders",
 )  # fmt: skip
 """Columns of the table."""
-RULES = {DISTANCE: YELLOW, LEADERS: BLACK, AHEAD: BLACK, MAJORITY: GREY}
+RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY}
 """Colors of the rules that need no network."""
 
 
