@@ -272,8 +272,8 @@ class SelectBest(BaseCallback):
     therefore replaces the kept one unless it is `significantly_worse` than the model with the highest mean so far.
     Comparing with that one, not with the kept one, prevents that small losses add up.
 
-    Measurements are made between updates and at the end, so that what has been collected has also been learned from.
-    They come before `SaveCheckpoint`, whose file then has them.
+    Measurements are made between updates and at the end, so that all that was collected has been learned from. In the
+    list of callbacks they stand before `SaveCheckpoint`, whose file then has them.
 
     Args:
         arena: arena that plays the same seeds at each measurement.
@@ -335,11 +335,8 @@ class SelectBest(BaseCallback):
         self._since = time.perf_counter()
 
     def _on_rollout_start(self) -> None:
-        if self._at_multiples:
-            due = self.num_timesteps // self._every > self._measured_at // self._every
-        else:
-            due = self.num_timesteps - self._measured_at >= self._every
-        if due:
+        since = self._measured_at % self._every if self._at_multiples else 0  # beyond the last multiple
+        if self.num_timesteps - self._measured_at + since >= self._every:
             self._measure()
 
     def _on_step(self) -> bool:

@@ -63,7 +63,7 @@ class EdgeScene:
     edge_prob: dict[str, Float[np.ndarray, " pairs"]]
     """Probability of an edge of any type, by checkpoint."""
     to_ego: "EdgeScene | None" = None
-    """The same of pairs whose receiver is the ego; None without an ego."""
+    """Pairs whose receiver is the ego; None without an ego."""
 
 
 def play_graph(task: GraphTask) -> list[EdgeScene]:
