@@ -134,8 +134,7 @@ def shift_in_place_of_ego_m(
     """
     shift_m = np.full(len(ids), np.nan)
     of_others = [intervention for intervention in tried if intervention.agent != ids[0]]
-    beside = copied(world)
-    if not of_others or not seat_driver(beside.env):
+    if not of_others or not seat_driver((beside := copied(world)).env):
         return shift_m
     point = BranchPoint(beside, of_others[0].steps)
     for intervention in of_others:

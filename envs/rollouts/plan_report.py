@@ -121,7 +121,7 @@ def plot_choices(ax: Axes, result: EnvPlans) -> Axes:
     _plot_estimates(ax, np.arange(len(found)), [one.right for one in found], f"{found[0].choices} pairs")
     ax.axhline(50, color="0.7", lw=0.8, ls=":", label="chance")
     ax.set(ylabel="right choices [%]", ylim=(0, 102))
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=8, loc="lower right")
     return _named(ax, result)
 
 

@@ -125,7 +125,7 @@ def window_loss(
 
 
 def reaction_weights(
-    batch: WindowBatch, weight: float, has_ego: bool = False, total: Total = of_one_process
+    batch: WindowBatch, weight: float, has_ego: bool, total: Total = of_one_process
 ) -> Float[Tensor, "batch agents"]:
     """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
 

@@ -3,12 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs.rollouts.branches import Branches
+from envs.rollouts.branches import Branches, copied
 from envs.rollouts.causal_labels import (
     ON_ROADS,
     CausalLabels,
     causal_labels,
-    copied,
     farthest,
     senders_of,
     shift_in_place_of_ego_m,

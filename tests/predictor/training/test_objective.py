@@ -294,7 +294,7 @@ def test_agents_that_react_to_one_that_is_gone_weigh_more(gone_at: int, weights:
     valid = torch.ones(1, 3, 3).bool()
     valid[0, gone_at:, 2] = False
     windows = WindowBatch(torch.zeros(1, 3, 3, 4), valid, torch.tensor([1]), types, attributes)
-    assert reaction_weights(windows, 3.0)[0, :2].tolist() == pytest.approx(weights)
+    assert reaction_weights(windows, 3.0, has_ego=False)[0, :2].tolist() == pytest.approx(weights)
 
 
 @pytest.mark.parametrize(("has_ego", "weights"), [(False, (7 / 4, 1 / 4)), (True, (1.0, 1.0))])
