@@ -161,7 +161,6 @@ def _learn(
         every,
         note,
         curve=run_dir / CURVE_FILE,
-        at_multiples=plan.repeatable,
         seconds=kept.get("seconds", 0.0),
         scalars=errors.scalars,
         say=progress.say,
@@ -279,10 +278,10 @@ class SelectBest(BaseCallback):
         arena: arena that plays the same seeds at each measurement.
         path: path of the selected model, written atomically.
         num_episodes: number of episodes per measurement.
-        every_steps: least number of environment steps between measurements; there is always one at the end.
+        every_steps: number of environment steps at whose multiples a measurement is due, at the next update; there is
+            always one at the end.
         note: what the policy needs beside its weights.
         curve: path of a JSON file with a line per measurement, written atomically; None writes none.
-        at_multiples: whether to measure at the multiples of `every_steps`, wherever the training was resumed.
         seconds: time that was learned before this start [s].
         scalars: called at each measurement; what it returns stands in TensorBoard and in the curve.
         say: called with a line on each measurement.
@@ -300,7 +299,6 @@ class SelectBest(BaseCallback):
         note: PolicyNote | None = None,
         *,
         curve: Path | None = None,
-        at_multiples: bool = False,
         seconds: float = 0.0,
         scalars: Callable[[], dict[str, float]] = dict,
         say: Callable[[str], None] = lambda line: None,
@@ -309,7 +307,7 @@ class SelectBest(BaseCallback):
         super().__init__()
         self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
-        self._curve, self._at_multiples, self._learned_s = curve, at_multiples, seconds
+        self._curve, self._learned_s = curve, seconds
         self._scalars, self._say = scalars, say
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
@@ -335,8 +333,7 @@ class SelectBest(BaseCallback):
         self._since = time.perf_counter()
 
     def _on_rollout_start(self) -> None:
-        since = self._measured_at % self._every if self._at_multiples else 0  # beyond the last multiple
-        if self.num_timesteps - self._measured_at + since >= self._every:
+        if self.num_timesteps // self._every > self._measured_at // self._every:
             self._measure()
 
     def _on_step(self) -> bool:

@@ -37,8 +37,6 @@ def seat_driver(env: Any) -> bool:
     if not isinstance(simulator, AbstractEnv) or len(simulator.controlled_vehicles) != 1:
         return False
     ego = simulator.controlled_vehicles[0]
-    if ego.lane is None:
-        return False
     driver = StandIn(
         ego.road, ego.position, ego.heading, ego.speed, getattr(ego, "target_lane_index", None),
         ego.lane.speed_limit, getattr(ego, "route", None),

@@ -123,7 +123,9 @@ def test_each_measurement_is_of_a_model_that_has_learned_from_all_that_it_collec
         assert torch.equal(weights, kept.policy.state_dict()[name]), name
 
 
-@pytest.mark.parametrize(("measured_at", "every", "expected"), [([8], 24, [8, 32, 48]), ([], 16, [16, 32, 48])])
+@pytest.mark.parametrize(
+    ("measured_at", "every", "expected"), [([8], 24, [8, 24, 48]), ([], 16, [16, 32, 48]), ([8], 20, [8, 24, 40, 48])]
+)
 def test_measurements_go_on_from_the_last_one_not_from_the_checkpoint(
     measured_at: list[int], every: int, expected: list[int], tmp_path: Path
 ):
@@ -131,7 +133,7 @@ def test_measurements_go_on_from_the_last_one_not_from_the_checkpoint(
     model, curve = make_ppo(), tmp_path / "curve.json"
     model.learn(16)
     curve.write_text(json.dumps([{"steps": step, "return": 0.0} for step in measured_at]))
-    select = SelectBest(Scripted(*[[0.0]] * 3), tmp_path / "best.zip", 1, every_steps=every, curve=curve)
+    select = SelectBest(Scripted(*[[0.0]] * 4), tmp_path / "best.zip", 1, every_steps=every, curve=curve)
     model.learn(32, reset_num_timesteps=False, callback=select)
     assert [point["steps"] for point in read_curve(curve)] == expected
 

@@ -305,6 +305,11 @@ def test_edges_to_an_ego_give_it_no_weight(has_ego: bool, weights: tuple[float, 
     types[0, 1, 0, 1], attributes[0, 1, 0, 1, STRENGTH] = 1, 2.0
     windows = WindowBatch(torch.zeros(1, 3, 2, 4), torch.ones(1, 3, 2).bool(), torch.tensor([1]), types, attributes)
     assert reaction_weights(windows, 3.0, has_ego)[0].tolist() == pytest.approx(weights)
+    rollout = torch.zeros(1, 2, 1, 4)
+    rollout[0, 0, 0, 0], rollout[0, 1, 0, 0] = 10.0, 20.0  # in scaled units 1 and 2 wrong, which cost 2 and 4
+    config = replace(SILENT, likelihood="laplace", causal_edges=True, reaction_weight=3.0)
+    _, parts = window_loss(model(has_ego=has_ego), windows, output()._replace(rollout=rollout), config)
+    assert float(parts["nll_rollout"]) == pytest.approx((weights[0] * 2 + weights[1] * 4) / 2)
 
 
 def test_the_weight_of_reactions_needs_causal_labels():
