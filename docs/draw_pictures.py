@@ -168,7 +168,6 @@ def draw_calibration(path: Path) -> None:
     names = list(dict.fromkeys(name for _, controls in measured.values() for name in controls))
     looks = dict(zip(names, looks_of(names), strict=True)) | {"model + Gaussian noise": {"color": ORANGE}}
     figure, ax = plt.subplots(figsize=(9, 1.4 + 0.25 * len(measured)), layout="constrained")
-    ax.axvspan(80, 97, color=GREY, alpha=0.15, lw=0)
     ax.axvline(90, color=BLACK, lw=0.8, ls=":", label="calibrated: 90 %")
     for place, (spread, controls) in enumerate(measured.values()):
         shares = {name: controls[name].coverage for name in names if name in controls}
