@@ -23,6 +23,7 @@ STYLE: Any = AS_TEXT | {
     "axes.spines.top": False,
     "grid.alpha": 0.3,
     "legend.frameon": False,
+    "legend.handlelength": 3.6,  # the longest dashes, twice
 }
 """Matplotlib's settings of every plot: `@rc_context(STYLE)`."""
 
