@@ -224,7 +224,10 @@ class Arm:
             full = np.zeros((batch, *(space.shape or ())), dtype=np.float32)
             if key in entries and self._shows(key):
                 several = full.ndim == _AXES_WITH_SAMPLES.get(key)
-                _fill(full, entries[key], only_first=several and not self.shown.modes)
+                target, values = full, entries[key]
+                if key in EDGE_KEYS:
+                    target, values = _halves(full), _halves(values)
+                _fill(target, values, only_first=several and not self.shown.modes)
             found[key] = full
         return found
 
@@ -234,6 +237,11 @@ class Arm:
         if key in EDGE_KEYS:
             return self.shown.edges
         return self.shown.what_if if key.startswith("what_if") else self.shown.future
+
+
+def _halves(edges: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns a view with the two directions apart: agent → ego, ego → agent."""
+    return edges.reshape(*edges.shape[:-1], 2, edges.shape[-1] // 2)
 
 
 def _fill(full: NDArray[np.float32], values: NDArray[np.float32], only_first: bool) -> None:

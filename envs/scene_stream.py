@@ -16,6 +16,7 @@ from predictor.online import MAX_ROWS, Chosen, OnlineForecaster
 from predictor.scene import Forecast, SceneBatch
 from predictor.scene_checks import MOST_STEPS, chosen_envs
 from predictor.support.config_checks import check_at_least, check_at_most, check_types
+from predictor.support.errors import ProtocolError
 from predictor.support.memory import check_count
 from predictor.support.runtime import resolve_device
 
@@ -98,6 +99,7 @@ class SceneStream:
         self._online = OnlineForecaster(forecaster, envs, agents, config.device, config.max_rows)
         self._noise = EnvNoise([config.seed + env for env in range(envs)])
         self._before: Sequence[np.random.Generator] = self._noise
+        self._rows: Int[np.ndarray, " envs"] | None = np.arange(envs)
 
     @property
     def forecaster(self) -> Forecaster:
@@ -117,15 +119,21 @@ class SceneStream:
         """Forecasts the latest scene of each environment again, with another number of samples.
 
         What observations hold does not change; draws, if the forecaster draws, come from the same noise.
+
+        Raises:
+            ProtocolError: only some environments gave the latest scenes.
         """
-        return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
+        return self._latest(num_samples, self._noise)
 
     def pictured(self, num_samples: int) -> Forecast:
         """Returns a forecast of the latest scene of each environment with this number of samples, to be drawn.
 
         No noise is used up: an episode that is filmed is the one that is not.
+
+        Raises:
+            ProtocolError: only some environments gave the latest scenes.
         """
-        return self._shown(self._online.forecast(self.horizon_steps, num_samples, deepcopy(self._noise)))
+        return self._latest(num_samples, deepcopy(self._noise))
 
     def what_if(self, plans: Float[np.ndarray, "entries plans horizon state"]) -> Forecast:
         """Forecasts each scene of the latest forecast again, for each plan of its ego, in the frame of `Forecast`.
@@ -159,9 +167,10 @@ class SceneStream:
         self._online.observe(self._given(scenes), envs)
         forecast = self._forecast_for(self._noise.of(np.arange(len(self._noise)) if envs is None else envs))
         if envs is None:
-            self.scenes, self.forecast = scenes, forecast
+            self.scenes, self.forecast, self._rows = scenes, forecast, np.arange(len(scenes))
         else:
             self._keep_some(scenes, forecast, envs)
+            self._rows = None
         self.seen = self.scenes
         return forecast
 
@@ -187,8 +196,23 @@ class SceneStream:
         kept[ended] = len(scenes) + np.arange(len(ended))
         index = torch.from_numpy(kept).to(forecast.xy.device)
         self.scenes, self.seen = SceneBatch.concatenate(scenes, successors)[kept], scenes
-        self.forecast = _changed(lambda field: field[index], forecast)
+        self.forecast, self._rows = _changed(lambda field: field[index], forecast), kept
         return forecast
+
+    def _latest(self, num_samples: int, noise: Sequence[np.random.Generator]) -> Forecast:
+        """Returns a forecast of the latest scene of each environment; closing scenes draw from a noise of their own."""
+        if self._rows is None:
+            raise ProtocolError("only some environments gave the latest scenes; take in a scene of each one first")
+        unused = sorted(set(range(self._rows.max() + 1)) - set(self._rows.tolist()))
+        drawn: Sequence[np.random.Generator] = noise
+        if unused:
+            of_row = {int(row): noise[env] for env, row in enumerate(self._rows)}
+            drawn = [of_row.get(row) or np.random.default_rng(row) for row in range(self._rows.max() + 1)]
+        forecast = self._shown(self._online.forecast(self.horizon_steps, num_samples, drawn))
+        if not unused:
+            return forecast
+        index = torch.from_numpy(self._rows).to(forecast.xy.device)
+        return _changed(lambda field: field[index], forecast)
 
     def _forecast_for(self, noise: Sequence[np.random.Generator]) -> Forecast:
         """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""

@@ -57,12 +57,12 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         seed: random seed of the samples' noise: environment i gets seed + i, until `reset(seed=…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
-            as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
-            where they run.
+            as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, of which each
+            process in which environments run has one.
         arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md).
 
     Attributes:
-        plan_names: names of the candidate plans; none without `what_if`.
+        plan_names: names of the candidate plans; none without `what_if`, but of an arm that plays plans.
 
     Raises:
         UserError: no vector environment; the environments report no scenes, differ from

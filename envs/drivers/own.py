@@ -61,21 +61,33 @@ class OwnDriver:
 
 
 def _copied(value: Any, memo: dict[int, Any]) -> Any:
-    """Returns a deep copy; that of a function has copies of what it closes over, which `copy.deepcopy` shares.
+    """Returns a deep copy; that of a function has copies of what it keeps, which `copy.deepcopy` shares.
 
-    Functions inside of containers and partials are shared with all that they close over.
+    A function keeps values in what it closes over, in its defaults and in attributes. Functions inside of containers
+    and partials are shared with all that they keep.
+
+    Raises:
+        UserError: a function of a module keeps attributes, which it finds by its name; or as `_copied_or_shared`.
     """
-    if not isinstance(value, FunctionType) or value.__closure__ is None:
+    if not isinstance(value, FunctionType):
         return copy.deepcopy(value, memo)
     if id(value) in memo:
         return memo[id(value)]
-    known = [id(cell) in memo for cell in value.__closure__]  # functions may share a variable
-    cells = tuple(memo.setdefault(id(cell), CellType()) for cell in value.__closure__)
-    made = FunctionType(value.__code__, value.__globals__, value.__name__, value.__defaults__, cells)
-    made.__kwdefaults__ = value.__kwdefaults__
+    name = value.__name__
+    if vars(value) and name in value.__code__.co_names and value.__globals__.get(name) is value:
+        raise UserError(
+            f"a driver of your own whose function {name} keeps attributes of itself cannot be copied with its "
+            "environment; keep them in variables of the function that makes it, or in an object"
+        )
+    closure = value.__closure__ or ()
+    known = [id(cell) in memo for cell in closure]  # functions may share a variable
+    cells = tuple(memo.setdefault(id(cell), CellType()) for cell in closure)
+    made = FunctionType(value.__code__, value.__globals__, name, None, cells)
     memo[id(value)] = made
+    made.__defaults__ = _copied_or_shared(value.__defaults__, memo)
+    made.__kwdefaults__ = _copied_or_shared(value.__kwdefaults__, memo)
     vars(made).update(copy.deepcopy(vars(value), memo))
-    for cell, own, filled in zip(cells, value.__closure__, known, strict=True):
+    for cell, own, filled in zip(cells, closure, known, strict=True):
         if filled:
             continue
         try:
@@ -87,7 +99,7 @@ def _copied(value: Any, memo: dict[int, Any]) -> Any:
 
 
 def _copied_or_shared(content: Any, memo: dict[int, Any]) -> Any:
-    """Returns a copy of what a function closes over; modules, locks, networks in training and such are shared.
+    """Returns a copy of what a function keeps; modules, locks, networks in training and such are shared.
 
     Raises:
         UserError: it has a place in a sequence, which a copy would move on.

@@ -1,5 +1,6 @@
 """Interface of plan models, and what they return."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
 from types import SimpleNamespace
@@ -115,7 +116,10 @@ def checked_plans(
         raise UserError(f"{source}: crashed must be true or false (dtype bool), got {plans.crashed.dtype}")
     if count < 1 or len(plans.actions) != count:
         raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
-    size = np.asarray(plans.size_m)
+    try:
+        size = np.asarray(plans.size_m)
+    except ValueError:  # ragged
+        size = np.zeros(0)
     if size.shape != (2,) or size.dtype.kind not in "fiu" or not (np.isfinite(size) & (size > 0)).all():
         raise UserError(f"{source}: size_m must be length and width [m], positive numbers, got {short(plans.size_m)}")
     fixed = getattr(model, "actions", None)  # with which policies that score plans choose
@@ -126,10 +130,9 @@ def checked_plans(
         )
     if not isinstance(plans.margin_m, Real) or not 0 <= float(plans.margin_m) < np.inf:
         raise UserError(f"{source}: margin_m must be finite and at least 0, got {plans.margin_m}")
-    later = None if plans.later_actions is None else [np.shape(actions)[:1] for actions in plans.later_actions]
-    if later not in (None, [(horizon_steps - 1,)] * count):
-        counts = [int(np.prod(size)) for size in later or ()]
-        raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {counts}")
+    later = None if plans.later_actions is None else [_length(actions) for actions in plans.later_actions]
+    if later not in (None, [horizon_steps - 1] * count):
+        raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {later}")
     if scene is not None and spec is not None:
         _check_begin(plans.states, scene, spec, source)
     return Plans(**vars(plans))
@@ -159,7 +162,19 @@ def _with_arrays(plans: Any, source: str) -> SimpleNamespace:
 
 def _same(fixed: Any, actions: tuple[Any, ...]) -> bool:
     """Returns whether these are the actions of plans."""
-    return np.shape(fixed)[:1] == (len(actions),) and all(map(np.array_equal, fixed, actions))
+    return _length(fixed) == len(actions) and all(_equal(one, other) for one, other in zip(fixed, actions, strict=True))
+
+
+def _length(actions: Any) -> int:
+    """Returns the number of actions; 1 of what is no sequence."""
+    return len(actions) if isinstance(actions, Sequence) or np.ndim(actions) else 1
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Returns whether two actions are equal; those of Tuple spaces part by part."""
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_equal, one, other))
+    return np.array_equal(one, other)
 
 
 def _check_begin(states: Float[np.ndarray, "plans horizon state"], scene: Scene, spec: SceneSpec, source: str) -> None:

@@ -40,7 +40,10 @@ class OutcomeKeys:
 
 def _flags(value: Any, keys: Sequence[str]) -> np.ndarray:
     """Returns whether, for each ego, as an array; a dict or a text, which would always be true, is refused."""
-    flags = np.asarray(value)
+    try:
+        flags = np.asarray(value)
+    except ValueError:  # rows of unequal length
+        flags = np.asarray(None)
     if flags.dtype.kind not in "buif":
         raise UserError(f"info {' or '.join(keys)} must be true or false, or so for each ego, got {short(value, 60)}")
     return flags

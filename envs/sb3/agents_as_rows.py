@@ -47,7 +47,10 @@ def random_actions(
         if isinstance(space, gym.spaces.Discrete):
             actions[agent] = int(space.start + generator.integers(space.n))
         elif isinstance(space, gym.spaces.Box) and space.is_bounded():
-            actions[agent] = generator.uniform(space.low, space.high).astype(space.dtype)
+            if np.issubdtype(space.dtype, np.integer):
+                actions[agent] = generator.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
+            else:
+                actions[agent] = generator.uniform(space.low, space.high).astype(space.dtype)
         else:
             raise UserError(
                 f"partner 'random' needs Discrete or bounded Box actions, agent '{agent}' has {space}; pass a callable"

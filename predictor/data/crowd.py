@@ -70,7 +70,7 @@ def overlay(episodes: list[Episode], axes: int, seed: int, steps: int) -> Episod
 
 
 def make_crowds(config: CrowdConfig) -> list[Episode]:
-    """Draws scenes until each crowd is large enough.
+    """Draws scenes until each crowd is large enough; one has no scene twice before it has all.
 
     Raises:
         UserError: no scene of the source is long enough, or no agent is present at `at_step`.
@@ -88,8 +88,10 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
     for wanted in config.num_agents:
         for _ in range(config.episodes):
             chosen: list[Episode] = []
+            order: list[int] = []
             while sum(int(e.valid[config.at_step].sum()) for e in chosen) < wanted:
-                chosen.append(usable[int(rng.integers(len(usable)))])
+                order = order or rng.permutation(len(usable)).tolist()
+                chosen.append(usable[order.pop()])
             crowds.append(overlay(chosen, store.info.spec.position_dim, len(crowds), config.episode_steps))
     return crowds
 

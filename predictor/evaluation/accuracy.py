@@ -94,7 +94,8 @@ class Tally:
     """Collects outcomes batch by batch and keeps a few numbers per window.
 
     Args:
-        std_m: spread per axis at each step [m] for the likelihood; empty, or shorter than the horizon, leaves it out.
+        std_m: spread per axis at each step [m] for the likelihood; empty, shorter than the horizon, or not finite at a
+            step, leaves it out.
         miss_threshold_m: threshold of the miss rate [m].
         partial_agents: whether agents with a partly known truth count: their displacement is the mean over the known
             steps, and their final one counts if the last step is known. By default they do not, so that every mean
@@ -108,7 +109,7 @@ class Tally:
         partial_agents: bool = False,
     ) -> None:
         """Begins without outcomes."""
-        self._std_m = tuple(std_m)
+        self._std_m = tuple(std_m) if np.isfinite(std_m).all() else ()
         self._threshold_m = miss_threshold_m
         self._partial = partial_agents
         self._shape: tuple[int, int, int] | None = None
@@ -280,7 +281,10 @@ def summarise(
 
 
 def fitted_std_m(outcomes: Iterable[Outcome]) -> tuple[float, ...]:
-    """Computes the standard deviation per axis of the first sample's error at each step [m] (maximum likelihood)."""
+    """Computes the standard deviation per axis of the first sample's error at each step [m] (maximum likelihood).
+
+    NaN at a step that no agent reaches.
+    """
     totals, counts = [], []
     for outcome in outcomes:
         squared = (outcome.forecast[:, 0] - outcome.future).square().sum(-1)
@@ -288,7 +292,7 @@ def fitted_std_m(outcomes: Iterable[Outcome]) -> tuple[float, ...]:
         counts.append(outcome.future.shape[-1] * outcome.valid.sum((0, 1)).cpu())
     if not totals:
         raise ValueError("a spread needs at least one outcome, got none")
-    variance = torch.stack(totals).sum(0) / torch.stack(counts).sum(0).clamp(min=1)
+    variance = torch.stack(totals).sum(0) / torch.stack(counts).sum(0)
     return tuple(variance.sqrt().clamp(min=1e-3).tolist())
 
 

@@ -62,11 +62,12 @@ def linear_r2(
     valid: Bool[np.ndarray, "*entries"],
     ridge: float = 1e-3,
     seed: int = 0,
+    groups: Int[np.ndarray, " entries"] | None = None,
 ) -> float | None:
     """Computes R² of a linear regression on all dimensions, fitted on one half and scored on the other.
 
-    The halves are drawn over the first axis, so that with (windows, receivers, senders) both directions of a spring
-    fall into the same half.
+    The halves are drawn over groups of the first axis, so that with (windows, receivers, senders) both directions of a
+    spring, and all windows of an episode, fall into the same half.
 
     Args:
         features: edge features.
@@ -74,12 +75,14 @@ def linear_r2(
         valid: which entries count.
         ridge: penalty per point on the weights of standardised features; small, for equal dimensions.
         seed: random seed of the halves.
+        groups: group of each entry of the first axis (its episode); None makes each one a group of its own.
 
     Returns:
         R², or None if a half has fewer than two valid entries or the targets of the scored half are all equal.
     """
-    order = np.random.default_rng(seed).permutation(len(valid))
-    fit, score = order[: len(order) // 2], order[len(order) // 2 :]
+    group = np.arange(len(valid)) if groups is None else np.unique(groups, return_inverse=True)[1]
+    order = np.random.default_rng(seed).permutation(group.max(initial=-1) + 1)
+    fit, score = np.isin(group, order[: len(order) // 2]), np.isin(group, order[len(order) // 2 :])
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
     if min(len(answers), int(valid[score].sum())) < 2:
         return None

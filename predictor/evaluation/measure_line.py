@@ -64,7 +64,7 @@ def _measure_store(
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
     chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, WINDOWS_SEED, burn_in)
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]
-    tallies, began = _Tallies(made, table, line), time.perf_counter()
+    tallies, began = _Tallies(made, table, line, windows.index[chosen, 0]), time.perf_counter()
     if made.device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
     for outcome in run_windows(
@@ -84,7 +84,7 @@ def _measure_store(
 class _Tallies:
     """Collects everything that is measured on one store."""
 
-    def __init__(self, made: LineForecaster, table: Table, line: Line) -> None:
+    def __init__(self, made: LineForecaster, table: Table, line: Line, episodes: np.ndarray) -> None:
         self._made, self._line, self._horizon = made, line, table.protocol.horizon_steps
         threshold_m = table.overlap_m or MISS_THRESHOLD_M
         self._horizon_only = Tally(made.std_m, threshold_m)
@@ -93,7 +93,7 @@ class _Tallies:
         self._has_density = isinstance(made.forecaster, GaussianResidual | NoisyConstantVelocity)
         self._types = max(made.forecaster.num_edge_types, table.num_label_types)
         self._matched = bool(table.num_label_types) and not line.train.get("type_label_weight")
-        self._graph, self._features = GraphTally(self._types), _Features()
+        self._graph, self._features = GraphTally(self._types), _Features(episodes)
         self._entropies: list[torch.Tensor] = []
         own = not line.residual_of  # the graph of another line is scored there
         self._scores_graph, self._scores_features = own and line.model in GRAPHS, own and line.model in FEATURED
@@ -150,7 +150,8 @@ def _known_types(outcome: Outcome, num_types: int) -> torch.Tensor | None:
 class _Features:
     """Collects edge features and true attributes over all windows, padded to the largest scene."""
 
-    def __init__(self) -> None:
+    def __init__(self, episodes: np.ndarray) -> None:
+        self._episodes = episodes
         self._features: list[np.ndarray] = []
         self._truth: list[np.ndarray] = []
         self._valid: list[np.ndarray] = []
@@ -177,7 +178,7 @@ class _Features:
         )
         return {
             "direct_r2": direct_r2(features[..., 0], truth, valid),
-            "linear_r2": linear_r2(features, truth, valid),
+            "linear_r2": linear_r2(features, truth, valid, groups=self._episodes),
         }
 
 

@@ -39,12 +39,13 @@ def _at(run: Any, path: Sequence[str]) -> Any:
 
 def _mean(values: Sequence[Any]) -> Any:
     first = values[0]
-    if isinstance(first, dict):
-        return {key: _mean([v[key] for v in values]) for key in first if all(key in v for v in values)}
-    if isinstance(first, list | tuple) and all(len(v) == len(first) for v in values):
-        return [_mean(parts) for parts in zip(*values, strict=True)]
     if any(v is None for v in values):
         return None
+    if isinstance(first, dict):
+        shared = {key: [v[key] for v in values] for key in first if all(key in v for v in values)}
+        return {key: parts[0] if key == "permutation" else _mean(parts) for key, parts in shared.items()}
+    if isinstance(first, list | tuple) and all(len(v) == len(first) for v in values):
+        return [_mean(parts) for parts in zip(*values, strict=True)]
     if isinstance(first, int | float) and not isinstance(first, bool) and any(v != first for v in values):
         return sum(values) / len(values)
     return first

@@ -115,8 +115,8 @@ class TrainConfig:
     """Weight of restricted labelling of edge types: the prior's and posterior's cross-entropy with known types (dG-VAE
     and dNRI)."""
     reaction_weight: float = 0.0
-    """Additional weight of agents that are about to react to an intervention: the roll-out's errors of an agent count
-    1 + this times the strength of its causal edge; needs `causal_edges`."""
+    """Additional weight of agents that are about to react to an intervention, or would where causal labels say so: the
+    roll-out's errors of an agent count 1 + this times the strength of its causal edge; needs `causal_edges`."""
     shift_weight: float = 0.0
     """Weight of the error of shifts: how far an intervention moves agents, beside how far it moves their forecasts;
     needs a store of branches with twins (`envs.collect --branches 4 --twins`) and one process."""
@@ -195,6 +195,12 @@ class TrainConfig:
         if self.refit_scales and (not self.init or self.only_spread or self.model != "dgvae"):
             raise UserError(
                 "refit_scales needs a dG-VAE to start from, and not only_spread; pass --init, or leave it out"
+            )
+        if self.only_spread and self.set:
+            raise UserError("only_spread keeps the network of its checkpoint; leave --set out")
+        if self.shift_weight and self.history_steps == 1:
+            raise UserError(
+                "shift_weight needs history_steps of at least 2: with 1, one that was taken out is in neither window"
             )
         if self.only_spread and not self.init:
             raise UserError("only_spread needs the checkpoint whose spread it trains; pass --init, or leave it out")

@@ -129,9 +129,11 @@ def reaction_weights(
 ) -> Float[Tensor, "batch agents"]:
     """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
 
-    Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react. Of
-    one that was taken out, the edges are those of the step before. The edges to an ego do not count: they are those of
-    a driver in its place, not of the policy whose motion was recorded.
+    Edges count whose causal label is that of the last observed step: in branches, those from an agent whose
+    intervention is the last thing that was observed, so that its receivers react; in undisturbed episodes with labels,
+    those to agents that would react. Of an agent that has just left, taken out or not, the edges are those of the step
+    before. The edges to an ego do not count: they are those of a driver in its place, not of the policy whose motion
+    was recorded.
 
     Args:
         batch: windows; their edges are causal ones, if they have any attributes.

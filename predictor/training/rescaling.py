@@ -63,7 +63,7 @@ def rescaled(model: nn.Module, name: str, scales: dict[str, tuple[float, ...]], 
     plain.load_state_dict(weights)
     copy.load_state_dict(weights)
     was_training = source.training
-    moved = (_forecast(plain) - _forecast(source.eval())).abs().max()
+    moved = (_forecast(plain, horizon_steps) - _forecast(source.eval(), horizon_steps)).abs().max()
     source.train(was_training)
     if not moved <= _SAME * max(spec.feature_scales):
         raise UserError(
@@ -73,7 +73,7 @@ def rescaled(model: nn.Module, name: str, scales: dict[str, tuple[float, ...]], 
 
 
 @torch.no_grad()
-def _forecast(model: Any) -> Tensor:
+def _forecast(model: Any, horizon_steps: int) -> Tensor:
     """Returns the forecast of a scene in motion, with all its modes."""
     spec, samples = model.spec, max(1, model.config.num_modes)
     noise = torch.Generator().manual_seed(0)
@@ -82,5 +82,5 @@ def _forecast(model: Any) -> Tensor:
     memory, belief = model.empty_memory(4, 5), None
     for step in range(3):
         memory, belief = model.observe(memory, states + 0.02 * step * states.roll(1, 0), valid)
-    found: Tensor = model.rollout(belief, samples, model.horizon_steps, generator=noise).states
+    found: Tensor = model.rollout(belief, horizon_steps, samples, generator=noise).states
     return found

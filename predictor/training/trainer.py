@@ -336,14 +336,15 @@ class Trainer:
         return float(np.mean(accuracy.mixture_nll)) if self.config.only_spread else accuracy.energy_m
 
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
-        """Returns accuracy on held-out episodes, and the spread of the single forecast per step and axis [m]."""
+        """Returns accuracy on held-out episodes, and the single forecast's spread per step and axis [m], if known."""
         self.model.eval()
         self.validated = self.step
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
             self.model, w, i, self.config.horizon_steps, samples, batch_size=_per_forward(w, i, samples),
             device=str(self.device))]  # fmt: skip
-        return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
+        std_m = fitted_std_m(outcomes)
+        return summarise(self.config.model, outcomes), std_m if np.isfinite(std_m).all() else ()
 
     def save(self, path: Path) -> None:
         """Writes the training state so that a kill leaves the old or the new one."""

@@ -190,6 +190,18 @@ def test_layout_adds_room_for_edges():
     env.close()
 
 
+def test_each_direction_of_edges_keeps_its_place_in_a_larger_layout():
+    """Both have room of their own: "ego → agent" begins where it begins for the forecaster with more types."""
+    env = ForecastObservation(make_env(FAST), "highway", arm=Arm(layout=EntryLayout(3, 10, True)), num_samples=2)
+    plain = ForecastObservation(make_env(FAST), "highway", num_samples=2)
+    (found, _), (own, _) = env.reset(seed=0), plain.reset(seed=0)
+    assert own["edge_probs"].any() and own["edge_features"].shape[-1] == 16
+    np.testing.assert_array_equal(found["edge_probs"][:, [0, 2]], own["edge_probs"])
+    np.testing.assert_array_equal(found["edge_features"][:, [*range(8), *range(10, 18)]], own["edge_features"])
+    assert not found["edge_probs"][:, [1, 3]].any() and not found["edge_features"][:, [8, 9, 18, 19]].any()
+    env.close(), plain.close()
+
+
 def test_an_unknown_arm_is_refused():
     with pytest.raises(UserError, match=r"arm must be one of forecast, .*, got 'psychic'"):
         Arm("psychic")

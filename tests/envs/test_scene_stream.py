@@ -10,7 +10,7 @@ import pytest
 from envs.observation import ForecastStream
 from envs.scene_stream import ForecastConfig
 from predictor.scene import Forecast, SceneBatch
-from predictor.support.errors import UserError
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import HIGHWAY_SPEC, PLURAL, assert_same, random_scenes, tiny_model
 
 ENVS, SAMPLES = 3, 4
@@ -195,6 +195,33 @@ def test_forecasting_again_draws_from_the_noise_of_each_environment():
     first, second = made.again(SAMPLES).xy, made.again(SAMPLES).xy
     assert (first[:, 1:] - second[:, 1:]).abs().max() > 1e-2
     assert_same(first[:, :1].numpy(), second[:, :1].numpy())
+
+
+@pytest.mark.parametrize("make", [plural, stream], ids=["modes", "draws"])
+def test_over_a_boundary_forecasting_again_is_of_the_new_episodes(make: Any):
+    made, plain = make(), make()
+    for each in (made, plain):
+        each.observe(scenes(0))
+        each.observe_boundary(scenes(1), np.array([0, 2]), scenes(2, 2))
+    for again in (made.pictured(3), made.again(3)):
+        assert len(again.xy) == ENVS and made.forecast is not None
+        assert_same(again.xy[:, :1].numpy(), made.forecast.xy[:, :1].numpy())
+    assert_same(plain.again(3).xy.numpy(), again.xy.numpy())
+    if make is stream:  # closing scenes take nothing of the noise of the episodes that follow
+        alone = make(envs=1, seed=1)
+        for each in (scenes(0), scenes(1)):
+            alone.observe(each[np.array([1])])
+        assert_same(again.xy[1:2].numpy(), alone.again(3).xy.numpy())
+
+
+def test_where_some_environments_came_alone_nothing_is_forecast_again():
+    made = stream()
+    made.observe(scenes(0))
+    made.take(scenes(1)[np.array([1])], np.array([1]))
+    with pytest.raises(ProtocolError, match="only some environments gave the latest scenes"):
+        made.again(2)
+    made.observe(scenes(2))
+    assert len(made.pictured(2).xy) == ENVS
 
 
 @pytest.mark.parametrize("samples", [1, SAMPLES, 9])

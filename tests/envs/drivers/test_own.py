@@ -114,6 +114,41 @@ def test_functions_share_their_variables_in_a_copy():
     assert [copied(None), copied(None)] == [3, 4] and driver(None) == 3
 
 
+def counts_in_a_default(env: Any, rng: np.random.Generator) -> Any:
+    """Keeps its count in a default, without a closure."""
+
+    def act(observation: Any, counted: list[int] = [0], *, twice: list[int] = [0]) -> int:  # noqa: B006
+        counted[0] += 1
+        twice[0] += 2
+        return counted[0] + twice[0]
+
+    return act
+
+
+def test_functions_have_their_own_defaults_in_a_copy():
+    driver = OwnDriver(f"own:{__name__}:counts_in_a_default", None, np.random.default_rng(0))
+    assert [driver(None), driver(None)] == [3, 6]
+    copied = copy.deepcopy(driver)
+    assert [copied(None), copied(None)] == [9, 12] and driver(None) == 9
+
+
+def counting(observation: Any) -> int:
+    counting.steps = getattr(counting, "steps", 0) + 1  # type: ignore[attr-defined]
+    return 1
+
+
+def counts_by_its_name(env: Any, rng: np.random.Generator) -> Any:
+    """Keeps its count as an attribute that it finds by its name, which is that of the original in every copy."""
+    return counting
+
+
+def test_a_function_that_finds_its_attributes_by_its_name_is_not_copied():
+    driver = OwnDriver(f"own:{__name__}:counts_by_its_name", None, np.random.default_rng(0))
+    driver(None)
+    with pytest.raises(UserError, match="whose function counting keeps attributes of itself cannot be copied"):
+        copy.deepcopy(driver)
+
+
 def test_a_driver_with_a_place_in_a_sequence_is_not_copied():
     driver = OwnDriver(f"own:{__name__}:follows_a_list", None, np.random.default_rng(0))
     driver(None)

@@ -239,6 +239,8 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
         (given(np.zeros((2, 3, 4)), None), "actions must be one for each plan, got None"),
         (given(np.zeros((2, 3, 4)), (0, 1), later=5), "later_actions must be one for each plan, got 5"),
         (given(np.zeros((2, 3, 4)), (0, 1), later=(1, 2)), r"later_actions need 2 for each of 2 plans, got \[1, 1\]"),
+        (given(np.zeros((2, 3, 4)), (0, 1), later=(((0, np.zeros(2)),),) * 2), r"later_actions need 2 .*got \[1, 1\]"),
+        (given(np.zeros((2, 3, 4)), (0, 1), size_m=((5.0, 2.0), 1.0)), "size_m must be length and width"),
         (given([[[0.0] * 4] * 3, [[0.0] * 4] * 2], (0, 1)), "states must be an array: "),
         (
             given(np.zeros((2, 3, 4)), (0, 1), crashed=np.zeros((2, 3), np.int64)),

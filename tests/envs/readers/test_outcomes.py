@@ -44,7 +44,7 @@ def test_of_several_egos_one_may_crash_and_all_must_succeed():
     assert keys.succeeded({"done": (True, False)}) is False
     assert keys.succeeded({"done": np.array([1.0])}) is True
     assert keys.succeeded({}) is None
-    for value in ({"speed": 3.0}, "no"):  # both would be true
+    for value in ({"speed": 3.0}, "no", ((True, False), True)):  # the first two would be true
         with pytest.raises(UserError, match="info hit must be true or false, or so for each ego, got"):
             keys.crashed({"hit": value})
 

@@ -547,6 +547,14 @@ def test_random_partners_repeat_with_the_seed_and_differ_between_copies():
     assert set(first[0]) <= {0, 1, 2}
 
 
+def test_random_actions_reach_both_bounds_of_whole_numbers():
+    own = {"a": spaces.Box(0, 1, (2,), np.int8)}
+    env = with_spaces(dict.fromkeys(own, BOX2), own)()
+    generator = np.random.default_rng(0)
+    drawn = np.stack([random_actions(env, {"a": 0}, generator)["a"] for _ in range(200)])
+    assert drawn.dtype == np.int8 and 0.4 < drawn.mean() < 0.6 and set(drawn.flat) == {0, 1}
+
+
 def test_random_actions_cover_each_agents_own_space():
     own = {"a": THREE, "b": BOX3, "c": spaces.MultiBinary(2)}
     env = with_spaces(dict.fromkeys(own, BOX2), own)()

@@ -55,6 +55,14 @@ def test_all_agents_move_as_recorded_and_scenes_share_a_centre():
     assert not crowd.states[:4, 3].any()  # absent agents hold zeros
 
 
+def test_no_scene_lies_upon_itself_before_all_are_in(tmp_path: Path):
+    scenes = [circling_episode(seed, agents=2) for seed in range(6)]
+    for crowd in make_crowds(config(store(tmp_path / "scenes", scenes), num_agents=(12,), episodes=4)):
+        now = crowd.states[0, :, :2]
+        apart = np.linalg.norm(now[:, None] - now[None], axis=-1)[~np.eye(len(now), dtype=bool)]
+        assert len(now) == 12 and apart.min() > 1e-6
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

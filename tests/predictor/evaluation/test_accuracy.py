@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
 from predictor.evaluation import displacement as metrics
@@ -224,6 +224,17 @@ def test_an_iterator_is_enough_and_forecasts_are_not_kept():
         tally.add(gaussian(0, windows=50))
     kept = [a for parts in (*tally._sums.values(), *tally._counts.values()) for a in parts]
     assert sum(a.size for a in kept) < 3 * 50 * 2 * 25  # far fewer numbers than the 240 per window of a forecast
+
+
+def test_a_step_that_nobody_reaches_has_no_spread_and_no_likelihood():
+    short = outcome([[[1.0, 2.0, 0.0]]], [[True, True, False]])
+    std_m = fitted_std_m([short])
+    assert std_m[:2] == pytest.approx((math.sqrt(0.5), math.sqrt(2.0))) and math.isnan(std_m[2])
+    whole = outcome([[[1.0, 2.0, 3.0]]], [[True, True, True]])
+    assert summarise("a", [whole], std_m).nll == []
+    assert np.isfinite(summarise("a", [whole], (1.0, 1.0, 1.0)).nll).all()
+    noisy = NoisyConstantVelocity.fit(spec(), std_m)  # fitted to the two steps that are known
+    assert noisy.growth == pytest.approx(1.0) and noisy.noise_m > 0
 
 
 def test_outcomes_of_different_shape_are_refused():

@@ -118,6 +118,16 @@ def test_linear_r2_takes_pairs_of_windows_and_keeps_a_window_together():
     assert apart is not None and apart > 0.9
 
 
+def test_linear_r2_keeps_the_windows_of_an_episode_together():
+    """An episode's own mark tells its target; windows of one episode in both halves would make it of use."""
+    episodes = np.repeat(np.arange(40), 5)
+    target = np.random.default_rng(0).normal(size=40)[episodes]
+    marks = np.eye(40)[episodes]
+    apart, together = linear_r2(marks, target, every(target)), linear_r2(marks, target, every(target), groups=episodes)
+    assert apart is not None and apart > 0.9
+    assert together is not None and together < 0.1
+
+
 def test_linear_r2_sees_only_what_counts():
     target = factors(count=1, points=100)[:, 0]
     valid = np.random.default_rng(0).random(100) < 0.5

@@ -34,6 +34,15 @@ def test_a_number_that_one_run_lacks_has_neither_mean_nor_limits():
     assert limits(row, "tests", "test", "min_ade_m") is None
 
 
+def test_what_is_no_number_is_not_averaged():
+    def matched(seed: int, order: list[int]) -> dict[str, object]:
+        return run(seed, 1.0) | {"graph": {"permutation": order, "accuracy": 0.9 + 0.02 * seed}}
+
+    row = joined([matched(0, [0, 1]), matched(1, [1, 0])])
+    assert row["graph"] == {"permutation": [0, 1], "accuracy": pytest.approx(0.91)}
+    assert joined([matched(0, [0, 1]), run(1, 1.0)])["graph"] is None  # nor what one run lacks
+
+
 def test_one_run_is_itself_and_has_no_limits():
     row = joined([run(7, 2.5)])
     assert row["tests"] == run(7, 2.5)["tests"] and row["seeds"] == [7]

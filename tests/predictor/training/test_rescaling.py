@@ -42,6 +42,20 @@ def test_forecasts_stay_and_weights_change(kind: str):
     assert source.config == any_model(kind).config and source.training is False
 
 
+def test_all_modes_are_compared_over_the_whole_horizon(monkeypatch: pytest.MonkeyPatch):
+    source, seen = any_model("dgvae-plural"), []
+    plain = type(source).rollout
+
+    def spy(self: Any, *args: Any, **kwargs: Any) -> Any:
+        futures = plain(self, *args, **kwargs)
+        seen.append(tuple(futures.states.shape[1:4:2]))
+        return futures
+
+    monkeypatch.setattr(type(source), "rollout", spy)
+    rescaled(source, "dgvae", SCALES, 7)
+    assert seen == [(source.config.num_modes, 7)] * 2
+
+
 def test_geometry_takes_the_new_scales_though_forecasts_move():
     source = any_model("dgvae-plural")
     copy = rescaled(source, "dgvae", {"geometry_scales": (20.0, 9.0)}, 3)

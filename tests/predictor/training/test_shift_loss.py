@@ -64,6 +64,11 @@ def test_what_does_not_count_has_no_effect(pairs: Pairs):
     assert loss(pairs, wild_m) == pytest.approx(0, abs=1e-3)
 
 
+def test_one_observed_step_shows_no_removal(tmp_path: Path):
+    with pytest.raises(UserError, match="shift_weight needs history_steps of at least 2"):
+        TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=1)
+
+
 def test_several_processes_do_not_share_pairs(tmp_path: Path):
     config = TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY)
     episodes = list(twins_of(0, 3.0))

@@ -496,6 +496,8 @@ def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
 def test_only_the_spread_needs_roll_outs_and_a_checkpoint_that_has_one(circles: Path, tmp_path: Path):
     with pytest.raises(UserError, match="only_spread trains the spread of roll-outs, and rollout_weight is 0"):
         config(circles, tmp_path / "second", init="anywhere", only_spread=True, rollout_weight=0.0, horizon_steps=2)
+    with pytest.raises(UserError, match="only_spread keeps the network of its checkpoint; leave --set out"):
+        config(circles, tmp_path / "second", init="anywhere", only_spread=True, set=("static_dim=1",))
     with pytest.raises(UserError, match="only_spread needs the checkpoint whose spread it trains; pass --init"):
         config(circles, tmp_path / "second", only_spread=True)
     train(config(circles, tmp_path / "first"))
