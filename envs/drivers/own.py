@@ -86,7 +86,7 @@ def _copied(value: Any, memo: dict[int, Any]) -> Any:
     memo[id(value)] = made
     made.__defaults__ = _copied_or_shared(value.__defaults__, memo)
     made.__kwdefaults__ = _copied_or_shared(value.__kwdefaults__, memo)
-    vars(made).update(copy.deepcopy(vars(value), memo))
+    vars(made).update(_copied_or_shared(vars(value), memo))
     for cell, own, filled in zip(cells, closure, known, strict=True):
         if filled:
             continue
