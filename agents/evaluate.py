@@ -45,6 +45,8 @@ from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NO_DRIVERS = "none"
 """Word that stands for no further drivers."""
+MOST_CONSTANTS = 32
+"""Largest number of constant actions that play beside a policy without being asked for."""
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
 
 
@@ -245,13 +247,13 @@ def compared_drivers(task: Task, names: Sequence[str] | None = None) -> tuple[st
 
 
 def constant_drivers(task: Task) -> tuple[str, ...]:
-    """Returns the drivers that take one action in every step; none without an ego or without discrete actions."""
+    """Returns the drivers that take one action in every step; none without an ego or a few discrete actions."""
     if task.is_multiagent:
         return ()
     env = task.make(disable_env_checker=True)
     drivers = tuple(constant_actions(env))
     env.close()
-    return drivers
+    return drivers if len(drivers) <= MOST_CONSTANTS else ()
 
 
 def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from rich.table import Table
 from agents.differences import DRAWS, reference_policy, return_differences
 from agents.episode_file import write_episodes
 from agents.runs import SUMMARY_FILE
-from agents.summaries import NEARLY_CONSTANT, PolicySummary, reports_only_crashes, summarize
+from agents.summaries import NEARLY_CONSTANT, PolicySummary, reports_only_events, summarize
 from agents.vec_envs import EpisodeResult
 from envs.registry import name_with
 from envs.rollouts.driving_measures import HARD_BRAKING_MPS2, LONGEST_S
@@ -59,8 +59,11 @@ class Evaluation:
     @property
     def summaries(self) -> list[PolicySummary]:
         """Summaries, one per policy."""
-        safe = reports_only_crashes(e.crashed for episodes in self.results.values() for e in episodes)
-        return [summarize(policy, episodes, safe) for policy, episodes in self.results.items()]
+        played = [e for episodes in self.results.values() for e in episodes]
+        safe, failed = (
+            reports_only_events(said) for said in ([e.crashed for e in played], [e.success for e in played])
+        )
+        return [summarize(policy, episodes, safe, failed) for policy, episodes in self.results.items()]
 
     @property
     def constant_policies(self) -> str:

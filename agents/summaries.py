@@ -86,13 +86,16 @@ def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
     return float(array.mean()), error
 
 
-def summarize(policy: str, episodes: Sequence[EpisodeResult], silent_is_safe: bool = False) -> PolicySummary:
+def summarize(
+    policy: str, episodes: Sequence[EpisodeResult], silent_is_safe: bool = False, silent_is_failure: bool = False
+) -> PolicySummary:
     """Computes the summary of one policy's episodes.
 
     Args:
         policy: its name.
         episodes: its episodes.
-        silent_is_safe: whether an episode without a word on crashes had none; see `reports_only_crashes`.
+        silent_is_safe: whether an episode without a word on crashes had none; see `reports_only_events`.
+        silent_is_failure: whether an episode without a word on success had none; see there, too.
     """
     reports = silent_is_safe or any(e.crashed is not None for e in episodes)
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
@@ -113,14 +116,14 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult], silent_is_safe: bo
             for role in roles
         },
         {action: count / max(1, actions.total()) for action, count in actions.most_common()},
-        *_rate([e.success for e in episodes]),
+        *_rate([bool(e.success) if silent_is_failure else e.success for e in episodes]),
         _mean_driving([e.driving for e in episodes if e.driving is not None]),
     )
 
 
-def reports_only_crashes(crashed: Iterable[bool | None]) -> bool:
-    """Returns whether the environment reports crashes only when they happen, judged by the episodes of all policies."""
-    return set(crashed) - {None} == {True}
+def reports_only_events(reported: Iterable[bool | None]) -> bool:
+    """Returns whether an environment reports crashes, or success, only when they happen, judged by all its episodes."""
+    return set(reported) - {None} == {True}
 
 
 def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:

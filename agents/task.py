@@ -133,6 +133,9 @@ class Task:
             raise UserError(
                 f"sizes_of takes a checkpoint, '{short(self.sizes_of)}' has no sizes of its own; leave it out"
             )
+        trusted = {named for named in (self.checkpoint, self.sizes_of) if named and (is_own(named) or is_remote(named))}
+        if len(trusted) > 1:  # who evaluates the run names one that is trusted
+            raise UserError("checkpoint and sizes_of are both imported or fetched; copy that of sizes_of here first")
         check_positive(self, "timeout_s")
         if self.what_if and self.observe == "none":
             raise UserError("what_if has no effect with observe=none; leave one out")

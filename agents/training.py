@@ -169,7 +169,8 @@ def _learn(
     def extra() -> dict[str, Any]:
         return {"seconds": select.seconds, "loop_errors": errors.sums()}
 
-    save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, extra, restart)
+    also = bool if plan.repeatable else select.has_kept  # what is not repeated goes on where the best model is its own
+    save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, extra, restart, also)
     callbacks = [CountSteps(plan.num_envs), errors, select, save, *([progress] if progress_bar else [])]
     try:
         model.learn(
@@ -242,19 +243,20 @@ class SaveCheckpoint(BaseCallback):
         note: PolicyNote | None = None,
         extra: Callable[[], dict[str, Any]] = dict,
         after: Callable[[], None] | None = None,
+        also: Callable[[], bool] = bool,
     ) -> None:
-        """Saves to `path` about every `every_steps` environment steps, note and `extra` inside; then calls `after`."""
+        """Saves to `path` about every `every_steps` steps and if `also`, note and `extra` inside, then calls `after`."""
         super().__init__()
         self._note = note
         self._path, self._every = path, every_steps
-        self._extra, self._after = extra, after
+        self._extra, self._after, self._also = extra, after, also
         self._saved_at = 0
 
     def _on_training_start(self) -> None:
         self._saved_at = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self._saved_at >= self._every:
+        if self.model.num_timesteps - self._saved_at >= self._every or self._also():
             self._saved_at = self.model.num_timesteps
             save_model(self.model, self._path, self._extra(), self._note, to_continue=True)
             if self._after is not None:
@@ -285,9 +287,6 @@ class SelectBest(BaseCallback):
         seconds: time that was learned before this start [s].
         scalars: called at each measurement; what it returns stands in TensorBoard and in the curve.
         say: called with a line on each measurement.
-
-    Attributes:
-        seconds: time that was learned, without measurements [s].
     """
 
     def __init__(
@@ -310,7 +309,7 @@ class SelectBest(BaseCallback):
         self._curve, self._learned_s = curve, seconds
         self._scalars, self._say = scalars, say
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
-        self._measured_at = 0
+        self._measured_at, self._kept_at = 0, -1
         self._highest: list[float] = []
         self._points: list[dict[str, Any]] = []
         self._since = time.perf_counter()
@@ -320,11 +319,15 @@ class SelectBest(BaseCallback):
         """Time that was learned, without measurements [s]."""
         return self._learned_s + time.perf_counter() - self._since
 
+    def has_kept(self) -> bool:
+        """Returns whether the model as it is now was measured and kept."""
+        return self._kept_at == self.model.num_timesteps
+
     def _on_training_start(self) -> None:
         """Continues from the results inside an existing file."""
         self._measured_at = begun = self.model.num_timesteps
-        try:
-            self._highest = list(read_note(self._path).get("highest_returns", []))
+        try:  # with nothing to go on from, a model of before is one of another training
+            self._highest = list(read_note(self._path).get("highest_returns", [])) * bool(begun)
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
         if self._curve is not None:
@@ -379,6 +382,7 @@ class SelectBest(BaseCallback):
             self._highest = returns
         extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
         save_model(self.model, self._path, extra, self._note)
+        self._kept_at = self.num_timesteps
 
 
 def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:

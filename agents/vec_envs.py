@@ -284,8 +284,9 @@ class SeededEpisodes(gym.Wrapper):
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._obs = obs
         self._rewards.append(float(reward))
-        if "speed" in info:
-            self._speeds_mps.append(float(info["speed"]))
+        speed_mps = info.get("speed")
+        if isinstance(speed_mps, int | float | np.integer | np.floating):  # others may call a vector so
+            self._speeds_mps.append(float(speed_mps))
         if self._action_names:
             self._actions[self._action_names[int(action)]] += 1
         crashed = self._keys.crashed(info)

@@ -12,9 +12,8 @@ from agents.task import EVALUATION_SEED, NO_CHECKPOINT, Task
 from agents.vec_envs import EpisodeResult, MakeCopy
 from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
-from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, entry_for
+from envs.registry import entry_for
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.video.film_forecasts import FilmForecasts, record_pictures, view_of
@@ -36,12 +35,9 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     Returns:
         The recording; None if no reader is registered for the environment.
     """
-    filmed = task
-    if task.observe == "none":
-        if not _has_reader(task):
-            return None
-        shown = None if task.env_id in MULTIAGENT_CHECKPOINTS else CONSTANT_VELOCITY
-        filmed = replace(task, observe="forecast", checkpoint=shown)
+    filmed = _with_forecasts(task)
+    if filmed is None:
+        return None
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
     try:
@@ -63,15 +59,21 @@ def _num_drawn(forecaster: Forecaster) -> int:
     return FAN if has_scale(forecaster) else 1
 
 
-def _has_reader(task: Task) -> bool:
-    env = task.make()
-    try:
-        multiagent_reader_for(env)
-    except UserError:
-        return False
-    finally:
-        env.close()
-    return True
+def _with_forecasts(task: Task) -> Task | None:
+    """Returns the task with forecasts to draw, those of the policy if it sees any; None where no reader is registered.
+
+    Else they are those that ship, or of constant velocity where these do not fit the environment.
+    """
+    if task.observe != "none":
+        return task
+    for checkpoint in (None, CONSTANT_VELOCITY):
+        shown = replace(task, observe="forecast", checkpoint=checkpoint)
+        try:
+            if shown.scene_spec is not None:
+                return shown
+        except UserError:
+            continue
+    return None
 
 
 @runtime_checkable
@@ -141,15 +143,16 @@ def recorded(
     plain.close()
     if not highway and not drawn:
         return None
-    shown = task
-    if task.observe == "none":
-        seen = None if task.env_id in CHECKPOINTS else CONSTANT_VELOCITY
-        shown = replace(task, observe="forecast", checkpoint=seen)
+    shown = _with_forecasts(task)
+    if shown is None:
+        return None
     env = shown.wrapped(_with_pictures(task))
     act, samples = _act(task, model), _num_drawn(env.forecaster)
     try:
         if drawn:
-            return record_pictures(FilmForecasts(env, num_samples=samples), act, seed=seed, max_steps=max_steps)
+            return record_pictures(
+                FilmForecasts(env, num_samples=samples, crash_key=task.crash_key), act, seed=seed, max_steps=max_steps
+            )
         return record_episode(env, act, seed=seed, max_steps=max_steps, num_samples=samples)
     finally:
         env.close()

@@ -142,7 +142,7 @@ def arguments_of(text: str) -> dict[str, Any]:
         text: text of a JSON object; empty for none.
 
     Raises:
-        UserError: it is no JSON object, or holds the id.
+        UserError: it is no JSON object, or holds the id or what commands set by themselves.
     """
     try:
         kwargs = as_object(parse_json(text or "{}", "env_kwargs"), "env_kwargs")
@@ -150,6 +150,9 @@ def arguments_of(text: str) -> dict[str, Any]:
         raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}: {error}") from error
     if "env_id" in kwargs or "id" in kwargs:
         raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
+    for name in _OF_GYMNASIUM:
+        if name in kwargs:
+            raise UserError(f"env_kwargs cannot hold {name}, which each command sets by itself; leave it out")
     return kwargs
 
 

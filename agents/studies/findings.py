@@ -24,7 +24,7 @@ from agents.studies.estimators import (
 )
 from agents.studies.plan import Study
 from agents.studies.results import Result
-from agents.summaries import NEARLY_CONSTANT, reports_only_crashes, wilson_interval
+from agents.summaries import NEARLY_CONSTANT, reports_only_events, wilson_interval
 from envs.drivers.planner import ORACLE, PLANNER, is_planner, planner_checkpoint
 from predictor.own_forecasters import is_own
 
@@ -122,7 +122,7 @@ class Findings:
 
     def _silence_is_safe(self, scenario: str) -> bool:
         lines = (results for (name, _), results in self.results.items() if name == scenario)
-        return reports_only_crashes(crashed for results in lines for r in results for crashed in _crashed(r))
+        return reports_only_events(crashed for results in lines for r in results for crashed in _crashed(r))
 
     def mean_of(self, scenario: str, line: Line, field: str) -> float:
         """Returns the mean of a field over all episodes of all runs; NaN if it is not reported."""

@@ -61,19 +61,25 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
         draw: how its pictures map the world (see `register_view`); None takes what is registered, or highway-env's.
         num_samples: number of futures drawn for each agent; the likelier, the more opaque.
         style: colours and widths of the drawing.
+        crash_key: key of the infos that says whether the ego has crashed; None takes the env's (`register_reader`).
 
     Raises:
         UserError: no `ForecastObservation`, no pictures, or no way to draw them.
     """
 
     def __init__(
-        self, env: gym.Env, draw: Draw | None = None, num_samples: int = 1, style: OverlayStyle | None = None
+        self,
+        env: gym.Env,
+        draw: Draw | None = None,
+        num_samples: int = 1,
+        style: OverlayStyle | None = None,
+        crash_key: str | None = None,
     ) -> None:
         """Draws nothing yet."""
         super().__init__(env)
         self._forecasts = _with_forecasts(env)
         self._draw = draw or view_of(env)
-        self._outcomes = outcome_keys(env)
+        self._outcomes = outcome_keys(env, crash_key)
         if self._draw is None and not is_highway_env(env):
             raise UserError(
                 f"nothing says where the world is in pictures of {type(env.unwrapped).__name__}; pass draw=, a "

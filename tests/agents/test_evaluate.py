@@ -103,7 +103,7 @@ def test_one_table_of_planner_and_constant_actions(tmp_path: Path, monkeypatch, 
     assert "5 of 5" in capsys.readouterr().out  # the bar knows that idle is one line, not two
 
 
-def test_constant_actions_are_compared_unless_others_are_named():
+def test_constant_actions_are_compared_unless_others_are_named(monkeypatch: pytest.MonkeyPatch):
     merge, racetrack = Task("merge-v1", "none"), Task("racetrack-v1", "none")
     constants = ("lane-left", "idle", "lane-right", "faster", "slower")
     assert compared_drivers(merge) == constants
@@ -111,6 +111,9 @@ def test_constant_actions_are_compared_unless_others_are_named():
     assert compared_drivers(merge, ("varied",)) == ("varied",)
     assert compared_drivers(merge, ("varied", "constant-actions")) == ("varied", *constants)
     assert compared_drivers(racetrack) == ()  # steering is not discrete
+    monkeypatch.setattr(evaluate, "MOST_CONSTANTS", 4)
+    assert compared_drivers(merge) == ()  # as many lines would be no table
+    assert compared_drivers(merge, ("constant-actions",)) == constants
     assert compared_drivers(Task("simple_tag_v3", "none")) == ()  # no ego
     with pytest.raises(UserError, match="--drivers none adds no line and stands alone, got varied none"):
         compared_drivers(merge, ("varied", "none"))

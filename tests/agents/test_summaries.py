@@ -67,6 +67,15 @@ def test_success_is_a_rate_over_the_episodes_that_report_it():
     assert line.crash_rate == pytest.approx(1 / 3)
 
 
+def test_success_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():
+    reached, silent = replace(EPISODES[0], success=True), replace(EPISODES[1], success=None)
+    evaluation = Evaluation("toy-v0", 10, {"good": [reached, silent], "lost": [silent, silent]})
+    assert [line.success_rate for line in evaluation.summaries] == [0.5, 0.0]
+    assert Evaluation("toy-v0", 10, {"lost": [silent]}).summaries[0].success_rate is None
+    told = replace(EPISODES[1], success=False)
+    assert Evaluation("toy-v0", 10, {"good": [reached, told, silent]}).summaries[0].success_rate == 0.5
+
+
 def test_measures_of_driving_are_means_over_the_episodes_that_have_them():
     assert summarize("ppo", EPISODES).driving == {}
     first = DrivingMeasures(30.0, 0.1, 4, 1.25, 2.5, None, None)

@@ -42,6 +42,11 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
         (TAG, {"observe": "none", "sizes_of": "simple-tag"}, "sizes_of has no effect with observe=none"),
         (TAG, {"observe": "zeros", "sizes_of": "constant-velocity"}, "'constant-velocity' has no sizes of its own"),
+        (
+            TAG,
+            {"checkpoint": "own:a:b", "sizes_of": "s3://bucket/ck"},
+            "are both imported or fetched; copy that of siz",
+        ),
         (TAG, {"observe": "zeros", "sizes_of": "own:my:forecaster"}, "'own:my:forecaster' has no sizes of its own"),
         (TAG, {"what_if": True}, f"what_if needs an environment with one ego, {TAG} has several learners"),
         ("merge-v1", {"env_kwargs": "{"}, "env_kwargs must be a JSON object, got '{': .*Expecting"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.algorithms import DivergedError, check_finite, even_batches
@@ -199,8 +200,19 @@ def test_the_best_result_of_an_earlier_start_counts(
 ):
     path = tmp_path / "best.zip"
     save_model(make_ppo(), path, {"selection_return": stored, "steps": 0, "highest_returns": [stored, stored + 1]})
+    model = make_ppo()
+    model.num_timesteps = 8
+    model.learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8), reset_num_timesteps=False)
+    assert (read_note(path)["steps"] == 16) is replaced
+
+
+def test_a_training_that_begins_anew_does_not_compare_with_a_lost_one(
+    make_selection: Callable[[int], EgoArena], tmp_path: Path
+):
+    path = tmp_path / "best.zip"
+    save_model(make_ppo(), path, {"selection_return": 100.0, "steps": 24, "highest_returns": [100.0, 101.0]})
     make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
-    assert (read_note(path)["steps"] == 8) is replaced
+    assert read_note(path)["steps"] == 8
 
 
 def test_one_episode_decides_nothing():
@@ -223,6 +235,14 @@ def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("agents.training.save_model", note_steps)
     make_ppo().learn(40, callback=SaveCheckpoint(tmp_path / "checkpoint.zip", every_steps=12))
     assert saved == [16, 32]
+
+
+def test_a_checkpoint_goes_with_each_model_that_is_kept(make_selection: Callable[[int], EgoArena], tmp_path: Path):
+    """A resumed training otherwise compares with a model of steps that it does not have."""
+    select = SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=16)
+    save = SaveCheckpoint(tmp_path / "checkpoint.zip", every_steps=1000, also=select.has_kept)
+    make_ppo().learn(24, callback=CallbackList([select, save]))
+    assert load_model(tmp_path / "checkpoint.zip", "ppo").num_timesteps == 16
 
 
 def test_seeds_of_training_selection_and_evaluation_are_apart():

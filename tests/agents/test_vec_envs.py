@@ -7,7 +7,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from agents.arena import run_episodes
 from agents.task import Task
-from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
+from agents.vec_envs import EPISODE_INFO, EpisodeResult, SeededEpisodes, make_venv
 from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
 from predictor.support.errors import UserError
@@ -38,6 +38,24 @@ class Silent(Dice):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, reward, terminated, truncated, {"speed": info["speed"]}
+
+
+class Vectors(Dice):
+    """Reports a speed that is no number of metres per second."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, info | {"speed": None if self._left % 2 else np.ones(2)}
+
+
+def test_what_is_no_speed_is_not_reported():
+    env = SeededEpisodes(Vectors(), "crashed")
+    env.queue([3])
+    env.reset()
+    info: dict[str, Any] = {}
+    while EPISODE_INFO not in info:
+        *_, info = env.step(1)
+    assert np.isnan(info[EPISODE_INFO].mean_speed_mps)
 
 
 def dice_venv(num_envs: int) -> VecEnv:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ from stable_baselines3 import PPO
 from agents.arena import MultiagentArena
 from agents.task import Task
 from agents.vec_envs import EpisodeResult
-from agents.video import _in_highway_env, film, film_extremes, record_task
+from agents.video import _in_highway_env, _with_forecasts, film, film_extremes, record_task, recorded
 from tests.agents.helpers import TOY, Meadow, policy_for
 
 SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
@@ -15,10 +16,7 @@ SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
 
 @pytest.mark.parametrize(("env_id", "learners"), [(SPREAD, ()), (TAG, ("adversary",))])
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
-def test_the_film_shows_the_episode_that_is_measured(
-    env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr("agents.video.MULTIAGENT_CHECKPOINTS", {})  # as long as none needs to ship
+def test_the_film_shows_the_episode_that_is_measured(env_id: str, learners: tuple[str, ...], observe: Any):
     task = Task(env_id, observe, learners=learners)
     model = policy_for(task)
     (result,) = MultiagentArena(task).play(model, [4])
@@ -27,6 +25,15 @@ def test_the_film_shows_the_episode_that_is_measured(
     assert recording.num_steps == result.length
     by_role = recording._moments[-1].returns
     assert by_role[learners[0] if learners else "agent"] == pytest.approx(result.episode_return, rel=1e-5)
+
+
+def test_where_the_shipped_forecasts_do_not_fit_those_of_constant_velocity_are_drawn():
+    """`highway` forecasts steps of 1 s; the policy sees no forecasts and may have other steps."""
+    task = Task("highway-fast-v0", "none", env_kwargs='{"config": {"policy_frequency": 5, "vehicles_count": 5}}')
+    recording = recorded(task, PPO("MlpPolicy", task.make(), device="cpu"), 4, max_steps=3)
+    assert recording is not None and len(recording) > 0
+    assert _with_forecasts(task) == replace(task, observe="forecast", checkpoint="constant-velocity")
+    assert _with_forecasts(Task("highway-fast-v0", "none")) == Task("highway-fast-v0", "forecast")
 
 
 def test_an_environment_without_reader_is_not_filmed():

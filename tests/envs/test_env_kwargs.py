@@ -52,6 +52,8 @@ def test_a_store_without_arguments_says_nothing():
         ("size=3", "env_kwargs must be a JSON object, got 'size=3'"),
         ("[3]", r"env_kwargs must be a JSON object, got '\[3\]'"),
         ('{"id": "merge-v1"}', "cannot hold its env_id"),
+        ('{"render_mode": "rgb_array"}', "env_kwargs cannot hold render_mode, which each command sets"),
+        ('{"disable_env_checker": true}', "env_kwargs cannot hold disable_env_checker"),
         ('{"sizes": 3}', "cannot make env 'highway-fast-v0' with {'sizes': 3}: TypeError: .*unexpected keyword"),
         ('{"config": 3}', "cannot make env 'highway-fast-v0' with {'config': 3}: TypeError"),
     ],
