@@ -245,7 +245,7 @@ class SaveCheckpoint(BaseCallback):
         after: Callable[[], None] | None = None,
         also: Callable[[], bool] = bool,
     ) -> None:
-        """Saves to `path` about every `every_steps` steps and if `also`, note and `extra` inside, then calls `after`."""
+        """Saves to `path` about every `every_steps` steps and if `also`, with note and `extra`; then calls `after`."""
         super().__init__()
         self._note = note
         self._path, self._every = path, every_steps
