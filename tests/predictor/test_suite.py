@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 
 from predictor import suite
@@ -23,7 +24,8 @@ from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
 from predictor.evaluation import measure_line as measuring
 from predictor.evaluation import paper_tables as tables
-from predictor.evaluation.measure_line import protocol_indices
+from predictor.evaluation.measure_line import _Features, protocol_indices
+from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.paper_tables import NUM_SAMPLES, Line
 from predictor.models import configure
 from predictor.reports.suite_tables import latex_table, markdown_report
@@ -466,3 +468,25 @@ def test_test_stores_too_short_for_the_protocol_are_refused(data: Path, tmp_path
     table = replace(tables.SPRINGS, train="long", tests={"test": "short"})
     with pytest.raises(UserError, match="test store of 'short' fits no window of the protocol"):
         suite.measure_line(table, line("constant-velocity"), tmp_path, table.budgets["smoke"], None, 0, "cpu")
+
+
+def test_features_of_an_episode_are_in_one_half_of_the_regression():
+    """An episode's own mark tells its attribute; windows of one episode in both halves would make it of use."""
+    episodes = np.repeat(np.arange(12), 4)
+    marks = torch.eye(12)[episodes][:, None, None].expand(-1, 2, 2, -1)
+    truth = torch.randn(12, generator=torch.Generator().manual_seed(0))[episodes][:, None, None, None].expand(
+        -1, 2, 2, -1
+    )
+    still = torch.zeros(48, 1, 2, 1, 2)
+    outcome = Outcome(
+        still, still[:, 0], torch.ones(48, 2, 1, dtype=torch.bool), edge_features=marks,
+        present=torch.ones(48, 2, dtype=torch.bool), edge_attributes=truth,
+    )  # fmt: skip
+    found = []
+    for groups in (episodes, np.arange(48)):
+        features = _Features(groups)
+        features.add(outcome)
+        scores = features.scores()
+        assert scores is not None
+        found.append(scores["linear_r2"])
+    assert found[0] < 0.1 and found[1] > 0.9

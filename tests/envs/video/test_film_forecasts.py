@@ -115,10 +115,14 @@ def test_a_crash_is_told_under_the_key_that_the_environment_names(monkeypatch: p
     assert ["crashed" in caption for caption in captions()] == [False, False, True]
 
 
-def captions() -> list[str]:
-    env = filmed()
+def captions(**options: Any) -> list[str]:
+    env = filmed(**options)
     env.reset(seed=0)
     return [(env.step(0), env._caption())[1] for _ in range(3)]
+
+
+def test_a_crash_is_told_under_the_key_that_is_asked_for():
+    assert ["crashed" in caption for caption in captions(crash_key="outcome.hit")] == [False, False, True]
 
 
 @pytest.mark.usefixtures("registered")

@@ -131,9 +131,14 @@ def test_steps_take_turns_with_few_and_all_modes(circles: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize(("kind", "samples"), [("dgvae-plural", 3), ("dgvae", trainer_module.VALIDATION_DRAWS)])
-def test_modes_are_validated_as_enumerated_and_others_by_draws(circles: Path, tmp_path: Path, kind: str, samples: int):
+def test_modes_are_validated_as_enumerated_and_others_by_draws(
+    circles: Path, tmp_path: Path, kind: str, samples: int, monkeypatch: pytest.MonkeyPatch
+):
     trainer = made(config(circles, tmp_path, **MODELS[kind]))
     (first, _), (second, _) = trainer.validate(), trainer.validate()
+    with monkeypatch.context() as patch:  # nobody reaches the last step
+        patch.setattr("predictor.training.trainer.fitted_std_m", lambda outcomes: (1.0, math.nan))
+        assert trainer.validate()[1] == ()
     assert first.num_samples == samples and first.energy_m == second.energy_m
     assert bool(first.mixture_nll) == bool(first.mixture_coverage) == (kind == "dgvae-plural")
 
