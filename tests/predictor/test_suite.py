@@ -489,4 +489,4 @@ def test_features_of_an_episode_are_in_one_half_of_the_regression():
         scores = features.scores()
         assert scores is not None
         found.append(scores["linear_r2"])
-    assert found[0] < 0.1 and found[1] > 0.9
+    assert found[0] < 0.1 and found[1] > 0.5
