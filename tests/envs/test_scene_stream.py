@@ -208,10 +208,15 @@ def test_over_a_boundary_forecasting_again_is_of_the_new_episodes(make: Any):
         assert_same(again.xy[:, :1].numpy(), made.forecast.xy[:, :1].numpy())
     assert_same(plain.again(3).xy.numpy(), again.xy.numpy())
     if make is stream:  # closing scenes take nothing of the noise of the episodes that follow
-        alone = make(envs=1, seed=1)
-        for each in (scenes(0), scenes(1)):
-            alone.observe(each[np.array([1])])
-        assert_same(again.xy[1:2].numpy(), alone.again(3).xy.numpy())
+        for env in (1, 2):
+            alone = make(envs=1, seed=env)
+            for each in (scenes(0), scenes(1)):
+                alone.observe(each[np.array([env])])
+            if env == 2:
+                alone.reset()
+                alone.observe(scenes(2, 2)[np.array([1])])
+            alone.pictured(3)
+            assert_same(again.xy[env : env + 1].numpy(), alone.again(3).xy.numpy())
 
 
 def test_where_some_environments_came_alone_nothing_is_forecast_again():
