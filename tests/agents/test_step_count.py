@@ -9,7 +9,7 @@ import pytest
 from agents.presets import DQNPreset, PPOPreset
 from agents.runs import CHECKPOINT_FILE, CURVE_FILE, load_model
 from agents.task import Task
-from agents.training import SaveCheckpoint, TrainingPlan, train
+from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, train
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from predictor.support.progress import WorkShown
 
@@ -52,6 +52,7 @@ def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
     monkeypatch.setattr(ParallelVecEnv, "step_wait", count)
     monkeypatch.setattr(SaveCheckpoint, "_on_rollout_start", note_save)
     monkeypatch.setattr(WorkShown, "to", show)
+    monkeypatch.setattr(SelectBest, "has_kept", lambda self: False)  # with which a checkpoint would go
     train(tiny(monkeypatch, learners, algorithm), tmp_path)
     assert stepped == shown == [64]
     assert [point["steps"] for point in json.loads((tmp_path / CURVE_FILE).read_text())] == [16, 32, 48, 64]
