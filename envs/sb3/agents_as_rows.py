@@ -128,7 +128,10 @@ class ParallelVecEnv(VecEnv):
         self.metadata = {**getattr(self.envs[0], "metadata", {}), **self.metadata}
 
     def seed(self, seed: int | Sequence[int] | None = None) -> Sequence[int | None]:
-        """Seeds copy i with seed + i, or seed[i], at the next reset; later episodes go on from its own generator."""
+        """Seeds copy i with seed + i, or seed[i], at the next reset; later episodes go on from its own generator.
+
+        Until it is called, the sampled futures of all copies have equal noise.
+        """
         first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
         self._seeds = [first[copy] if isinstance(first, Sequence) else first + copy for copy in self.copies_of_envs]
         return self._seeds
