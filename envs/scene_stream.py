@@ -203,14 +203,12 @@ class SceneStream:
         """Returns a forecast of the latest scene of each environment; closing scenes draw from a noise of their own."""
         if self._rows is None:
             raise ProtocolError("only some environments gave the latest scenes; take in a scene of each one first")
-        unused = sorted(set(range(self._rows.max() + 1)) - set(self._rows.tolist()))
-        drawn: Sequence[np.random.Generator] = noise
-        if unused:
-            of_row = {int(row): noise[env] for env, row in enumerate(self._rows)}
-            drawn = [of_row.get(row) or np.random.default_rng(row) for row in range(self._rows.max() + 1)]
+        rows = int(self._rows.max()) + 1
+        if rows == len(self._rows):
+            return self._shown(self._online.forecast(self.horizon_steps, num_samples, noise))
+        of_row = {int(row): noise[env] for env, row in enumerate(self._rows)}
+        drawn = [of_row.get(row) or np.random.default_rng(row) for row in range(rows)]
         forecast = self._shown(self._online.forecast(self.horizon_steps, num_samples, drawn))
-        if not unused:
-            return forecast
         index = torch.from_numpy(self._rows).to(forecast.xy.device)
         return _changed(lambda field: field[index], forecast)
 

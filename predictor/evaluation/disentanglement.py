@@ -82,7 +82,8 @@ def linear_r2(
     """
     group = np.arange(len(valid)) if groups is None else np.unique(groups, return_inverse=True)[1]
     order = np.random.default_rng(seed).permutation(group.max(initial=-1) + 1)
-    fit, score = np.isin(group, order[: len(order) // 2]), np.isin(group, order[len(order) // 2 :])
+    fit = np.isin(group, order[: len(order) // 2])
+    score = ~fit
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
     if min(len(answers), int(valid[score].sum())) < 2:
         return None
