@@ -9,13 +9,18 @@ variables are kept. Every block is timed; a comment on the line before a block s
 
 A short form (one or several lines) runs instead of its block. It must call the same programs with at least the same
 options, or import the same names, so that a renamed option or module is still found in the text.
+
+`--within SECONDS` begins no page after that time and names those that are left, for a machine that may be slow; each
+commit has an order of its own, so that the pages that are left differ.
 """
 
 import argparse
 import ast
 import contextlib
 import json
+import math
 import os
+import random
 import re
 import select
 import shlex
@@ -27,13 +32,15 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 600.0
 """Longest time of a block [s]; longer ones need a short form."""
 TAIL_LINES = 25
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables that say how many threads the libraries of a process use."""
 OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdown", "diff", "make", "csv")
 """Languages of blocks that are not run."""
 
@@ -178,11 +185,16 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
 class Page:
     """Keeps the state that the blocks of a page share: a folder, exported variables, Python's names."""
 
-    def __init__(self, folder: Path, limit_s: float = LIMIT_S) -> None:
-        """Takes the folder to run in; `python` on the path is the interpreter that runs this check."""
+    def __init__(self, folder: Path, limit_s: float = LIMIT_S, jobs: int = 1) -> None:
+        """Takes the folder to run in; `python` on the path is the interpreter that runs this check.
+
+        A page that runs beside others gets its share of the cores: two processes with a thread on every core wait for
+        each other, which was measured to take twenty times as long as one after the other.
+        """
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
         self.folder, self.limit_s, self.stopped = folder, limit_s, False
-        self.environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PATH": path}
+        threads = dict.fromkeys(THREADS, str(max(1, (os.cpu_count() or 1) // jobs))) if jobs > 1 else {}
+        self.environment = threads | {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PATH": path}
         self._bash: subprocess.Popen[str] | None = None
         self._python: subprocess.Popen[str] | None = None
         self._printed = tempfile.TemporaryFile("w+")
@@ -276,22 +288,34 @@ def copy_tree(target: Path, root: Path = ROOT) -> None:
             shutil.copy2(root / name, target / name)
 
 
-def check(pages: Sequence[Path], limit_s: float = LIMIT_S, jobs: int = 1) -> Iterator[Result]:
+def shuffled(pages: Sequence[Path], root: Path = ROOT) -> list[Path]:
+    """Returns pages in the order of the present commit."""
+    commit = subprocess.check_output(["git", "-C", str(root), "rev-parse", "HEAD"], text=True)
+    return random.Random(commit).sample(pages, len(pages))
+
+
+def check(
+    pages: Sequence[Path], limit_s: float = LIMIT_S, jobs: int = 1, within_s: float = math.inf
+) -> Iterator[Result]:
     """Runs the blocks of pages of this repository, each page in its own copy; yields the results in the pages' order.
 
     Args:
         pages: pages.
         limit_s: longest time of a block [s].
         jobs: number of pages that run at the same time.
+        within_s: time after which no page begins [s]; the blocks of those that are left are skipped.
 
     Raises:
         DocsError: a page has a block that cannot be understood.
     """
     every = [blocks_of(page) for page in pages]  # errors of the pages are raised before any block runs
     opened: list[Page] = []
+    last_start = time.monotonic() + within_s
     with ThreadPoolExecutor(jobs) as pool:
         try:
-            for results in pool.map(lambda blocks: _run_page(blocks, limit_s, opened), filter(None, every)):
+            for results in pool.map(
+                lambda blocks: _run_page(blocks, limit_s, jobs, opened, last_start), filter(None, every)
+            ):
                 yield from results
         except BaseException:  # Ctrl-C, which blocks do not get: they run in sessions of their own
             pool.shutdown(wait=False, cancel_futures=True)
@@ -300,11 +324,18 @@ def check(pages: Sequence[Path], limit_s: float = LIMIT_S, jobs: int = 1) -> Ite
             raise
 
 
-def _run_page(blocks: Sequence[Block], limit_s: float, opened: list[Page]) -> list[Result]:
-    """Runs the blocks of one page, until it is stopped; adds the page to those that were opened."""
+def _run_page(
+    blocks: Sequence[Block], limit_s: float, jobs: int, opened: list[Page], last_start: float = math.inf
+) -> list[Result]:
+    """Runs the blocks of one page, until it is stopped; adds the page to those that were opened.
+
+    From `last_start` (`time.monotonic`) on its blocks are read and not run.
+    """
+    if time.monotonic() >= last_start:
+        return [_left_out(block) for block in blocks]
     with tempfile.TemporaryDirectory() as folder:
         copy_tree(Path(folder))
-        page = Page(Path(folder), limit_s)
+        page = Page(Path(folder), limit_s, jobs)
         opened.append(page)
         try:
             return [page.run(block) for block in blocks if not page.stopped]
@@ -312,20 +343,35 @@ def _run_page(blocks: Sequence[Block], limit_s: float, opened: list[Page]) -> li
             page.close()
 
 
+def _left_out(block: Block) -> Result:
+    """Returns the result of a block that is read and not run."""
+    if block.skipped:
+        return Result(block, 0.0)
+    try:
+        block.to_run  # noqa: B018
+    except DocsError as wrong:
+        return Result(block, 0.0, str(wrong))
+    return Result(replace(block, note="skip because no time was left"), 0.0)
+
+
 def main() -> int:
     """Runs the command; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", type=Path, help="pages to check; all of README.md and docs/ if left out")
     parser.add_argument("--jobs", type=int, default=1, help="number of pages that run at the same time")
+    parser.add_argument("--within", type=float, help="seconds after which no page begins", metavar="SECONDS")
     parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="seconds that a block may take")
     arguments = parser.parse_args()
     pages = [page.resolve() for page in arguments.pages] or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     outside = [str(page) for page in pages if not page.is_relative_to(ROOT)]
     if outside:
         parser.error(f"pages must be of this repository, {', '.join(outside)} is not")
+    within_s = math.inf if arguments.within is None else arguments.within
+    if arguments.within is not None:
+        pages = shuffled(pages)
     results = []
     try:
-        for result in check(pages, arguments.limit_s, arguments.jobs):
+        for result in check(pages, arguments.limit_s, arguments.jobs, within_s):
             print(result, flush=True)
             results.append(result)
     except DocsError as error:

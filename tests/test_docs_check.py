@@ -1,6 +1,7 @@
 """The check of the documentation's blocks fails where a block is wrong, with its place and the reason."""
 
 import importlib.util
+import os
 import signal
 import subprocess
 import sys
@@ -216,6 +217,59 @@ def test_pages_run_side_by_side_and_are_told_in_their_order(tmp_path: Path):
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done
     assert done.stdout.index("README.md:1 ") < done.stdout.index("docs/second.md:1 ")
+
+
+@pytest.mark.parametrize(
+    ("jobs", "own", "threads"), [(1, None, "unset"), (2, None, "2"), (8, None, "1"), (2, "3", "3")]
+)
+def test_pages_side_by_side_share_the_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int, own: str | None, threads: str
+):
+    """Two processes with a thread on every core wait for each other; who sets the number gets it."""
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", own)
+    monkeypatch.setattr(docs_check, "copy_tree", lambda target: None)
+    page = tmp_path / "page.md"
+    page.write_text(f"```bash\ntest ${{OMP_NUM_THREADS-unset}} = {threads}\n```\n")
+    blocks = docs_check.blocks_of(page, tmp_path)
+    assert [result.error for result in docs_check._run_page(blocks, 30.0, jobs, [])] == [""]
+
+
+def test_pages_that_find_no_time_are_read_and_not_run(tmp_path: Path):
+    ran = "```bash\ntouch ran\n```\n"
+    (tmp_path / "first.md").write_text(ran)
+    (tmp_path / "wrong.md").write_text(
+        f"<!-- docs-check: short: python -m a -->\n{ran.replace('touch', 'python -m b')}"
+    )
+    for name, last_start, said in [
+        ("first", time.monotonic() - 1, "skipped because no time was left"),
+        ("wrong", time.monotonic() - 1, "FAILED"),
+    ]:
+        blocks = docs_check.blocks_of(tmp_path / f"{name}.md", tmp_path)
+        (found,) = docs_check._run_page(blocks, 30.0, 1, [], last_start)
+        assert said in str(found)
+
+
+def test_a_time_limit_leaves_other_pages_out_at_other_commits(tmp_path: Path):
+    """The first two pages begin at once, and no other one before the limit."""
+    text = "```bash\nsleep 2\n```\n"
+    place = repository(tmp_path / "repository", **{name: text for name in "abcdef"}, README=text)
+    orders = []
+    for message in ("one", "two"):
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        dates = {"GIT_AUTHOR_DATE": "2026-01-01T00:00Z", "GIT_COMMITTER_DATE": "2026-01-01T00:00Z"}
+        subprocess.run(
+            ["git", *who, "commit", "-q", "--allow-empty", "-m", message],
+            cwd=place, env=os.environ | dates, check=True,
+        )  # fmt: skip
+        command = [sys.executable, ".ci/docs_check.py", "--jobs", "2", "--within", "1"]
+        done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done
+        assert done.stdout.count(" ok") == 2 and done.stdout.count("skipped because no time was left") == 5
+        orders.append([line.split()[0] for line in done.stdout.splitlines()[:7]])
+    assert orders[0] != orders[1]
 
 
 @pytest.mark.parametrize("language", ["bash", "python"])
