@@ -9,7 +9,7 @@ EXTRAS ?= core scores envs rl study contrib tune hub ray envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test test-shapes test-cluster storm soak sbom fuzz check docs docs-check install-check bench bench-check clean
+.PHONY: help .venv train test test-all test-shapes test-cluster storm soak sbom fuzz check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,15 +31,18 @@ train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continu
 # Checks shapes and types of every call; without the checker at the end nothing is checked.
 SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
 
-test: .venv/.tools ## run the tests, TEST_JOBS at a time; TEST_ARGS are pytest's
+test: .venv/.tools ## run the tests but the slow ones, TEST_JOBS at a time; TEST_ARGS are pytest's
 	.venv/bin/python -m pytest -n $(TEST_JOBS) --dist worksteal $(TEST_ARGS)
+
+test-all: .venv/.tools ## run the slow tests as well: takes twice as long
+	$(MAKE) test TEST_ARGS="-m 'not cluster' $(TEST_ARGS)"
 
 test-cluster: .venv/.tools ## run the tests on a Ray cluster of three nodes on this machine: two minutes
 	.venv/bin/python -m pip install -q -c constraints.txt -e '.[all,ray]'
 	.venv/bin/python -m pytest -m cluster tests/test_cluster.py
 
-test-shapes: .venv/.tools ## run the tests with shapes and types of every call checked: takes twice as long
-	$(MAKE) test TEST_ARGS="$(SHAPES)"
+test-shapes: .venv/.tools ## make test with shapes and types of every call checked: takes twice as long
+	$(MAKE) test TEST_ARGS="$(SHAPES) $(TEST_ARGS)"
 
 storm: .venv/.tools ## kill the commands at random moments, fill their disks (KILLS and POINTS times), try all bad inputs
 	.venv/bin/python -m tests.storm.kills --kills $(KILLS)
@@ -76,8 +79,8 @@ docs: .venv/.site ## build the site into build/site: runs the tutorials, fails o
 	.venv/bin/python -m sphinx -W --keep-going -E -q -j $(DOCS_JOBS) -c docs -d build/site-cache . build/site
 	.venv/bin/python -m docs.check_links build/site
 
-docs-check: .venv/.tools ## run every command and every block of README.md and docs/ as written, in a copy of the tree
-	.venv/bin/python .ci/docs_check.py --jobs $(TEST_JOBS)
+docs-check: .venv/.tools ## run every block of README.md and docs/ as written, in a copy of the tree; DOCS_ARGS are .ci/docs_check.py's
+	.venv/bin/python .ci/docs_check.py --jobs $(TEST_JOBS) $(DOCS_ARGS)
 
 install-check: ## build the wheel and try EXTRAS, each in a fresh environment: five minutes and 2 GB each
 	$(PYTHON) .ci/install_check.py --only $(EXTRAS)

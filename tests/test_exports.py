@@ -57,6 +57,7 @@ def test_importing_a_package_imports_nothing_heavy(package: str):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("blocked", "statement"),
     [

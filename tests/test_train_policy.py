@@ -145,6 +145,7 @@ def test_best_model_carries_its_result(finished: tuple[Path, str]):
     assert (run / "policy.zip").read_bytes() == (run / "best_model.zip").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = finished
     arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"]
@@ -154,6 +155,7 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
+@pytest.mark.slow
 def test_a_policy_that_ships_is_measured_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -317,6 +319,7 @@ def test_pursuers_are_evaluated_again(chased: tuple[Path, str], monkeypatch: pyt
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
+@pytest.mark.slow
 def test_agents_without_forecasts_are_trained_and_filmed(tmp_path: Path):
     arguments = [*TINY[2:], "--env-id", "simple_spread_v3", "--observe", "none", "--steps", str(3 * ROLLOUT)]
     run, printed = trained(tmp_path / "run", *arguments)
@@ -328,6 +331,7 @@ def test_agents_without_forecasts_are_trained_and_filmed(tmp_path: Path):
     assert_video(run / "video.mp4", least_s=1)
 
 
+@pytest.mark.slow
 def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path):
     pytest.importorskip("envpool")
     arguments = ["--num-envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
@@ -386,6 +390,7 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
     assert task.learners == learners
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(
     ("arguments", "interrupted_at"),

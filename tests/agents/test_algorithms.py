@@ -62,6 +62,7 @@ def test_every_algorithm_stands_in_every_table():
         assert algorithm_class(name).__name__.lower().replace("recurrent", "recurrent-") == name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_it_trains_goes_on_and_is_measured(algorithm: Algorithm, tmp_path: Path):
     def plan(steps: int) -> TrainingPlan:

@@ -40,6 +40,7 @@ def test_policies_of_envpool_are_measured_on_the_original(monkeypatch: pytest.Mo
     arena.close()
 
 
+@pytest.mark.slow
 def test_an_ego_is_played_as_in_a_plain_loop():
     arena = EgoArena(Task("highway-fast-v0", "none"), 1)
     env = make_env("highway-fast-v0")

@@ -25,6 +25,7 @@ def test_all_policies_play_the_same_held_out_seeds():
         assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]
 
 
+@pytest.mark.slow
 def test_the_planner_is_a_policy_and_a_line_of_the_table():
     """A driver in the place of a trained policy, and another one beside the baselines; each name once."""
     task = Task("highway-fast-v0", "none")
@@ -88,6 +89,7 @@ def test_constant_actions_stand_for_one_driver_each():
     assert checked_drivers(Task("CartPole-v1", "none"), ("constant-actions",)) == ("action-0", "action-1")
 
 
+@pytest.mark.slow
 def test_one_table_of_planner_and_constant_actions(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
     command = "--policy planner:constant-velocity --env-id intersection-v2 --episodes 1"
     monkeypatch.setattr("sys.argv", ["evaluate", *command.split(), "--num-envs", "1", "--out", str(tmp_path)])

@@ -7,6 +7,7 @@ from agents.task import Observe, Task
 from agents.training import TrainingPlan, read_curve, train
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize("observe", ["constant-velocity", "forecast", "none"])
 def test_the_curve_and_tensorboard_hold_the_errors_of_the_forecasts_that_were_acted_on(

@@ -59,6 +59,7 @@ def seen_by(task: Task, steps: int = 12) -> tuple[Any, dict[str, torch.Tensor]]:
     return space, {key: torch.from_numpy(np.stack([one[key] for one in same])) for key in space}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS])
 def test_no_entry_is_constant_or_only_saturated(env_id: str):
     task = Task(env_id)

@@ -85,6 +85,7 @@ def logits(model: PPO, shown: dict[str, torch.Tensor]) -> torch.Tensor:
         return model.policy.get_distribution(shown).distribution.logits
 
 
+@pytest.mark.slow
 def test_what_is_learned_of_one_plan_holds_for_all():
     model = make_ppo().learn(2048)
     shown = observed(400, seed=1)
@@ -93,6 +94,7 @@ def test_what_is_learned_of_one_plan_holds_for_all():
     assert (logits(model, shown).argmax(-1) == wanted).float().mean() > 0.95
 
 
+@pytest.mark.slow
 def test_values_of_plans_are_learned_for_all_at_once():
     model = make_dqn().learn(1500)
     shown = observed(400, seed=1)

@@ -129,6 +129,7 @@ def test_every_arm_has_the_same_space(env_id: str):
     assert all(space == spaces[0] for space in spaces)
 
 
+@pytest.mark.slow
 def test_another_scenes_forecasts_have_the_sizes_of_the_other_arms(tmp_path: Path):
     """The checkpoint forecasts fewer steps than the one that ships, by which the observation is laid out."""
     short = save_tiny(tmp_path / "short", HIGHWAY_SPEC)

@@ -348,6 +348,7 @@ def dies_after(calls: int, kind: type, method: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(kind, method, call_and_die)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize(
     ("algorithm", "task", "preset"),
@@ -458,6 +459,7 @@ def test_a_finished_run_keeps_its_policy_whatever_else_is_deleted(gone: tuple[st
     assert (tmp_path / "curve.json").read_bytes() == curve
 
 
+@pytest.mark.slow
 def test_errors_in_the_loop_cover_all_steps_since_the_last_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Also those before a checkpoint, where environments start anew, and before a stop."""
     preset = PPOPreset(n_steps=8, batch_size=8, n_epochs=1, net_arch=(8,))

@@ -139,6 +139,7 @@ class Killed(BaseException):
     """Stands for a kill."""
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_a_killed_tuning_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Killed in the second trial, after a checkpoint; started anew twice, the second time for more trials."""
@@ -172,6 +173,7 @@ def test_a_killed_tuning_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: p
     assert len(json.loads((tmp_path / "killed" / "tuning.json").read_text())["provenance"]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_a_training_with_other_hyperparameters_is_not_continued(tmp_path: Path):
     """As after an update of Optuna that draws other values."""
@@ -189,6 +191,7 @@ def test_a_training_with_other_hyperparameters_is_not_continued(tmp_path: Path):
     assert "gamma = 0.8\n" in (folder / "preset.toml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_trials_whose_networks_diverge_count_as_worst(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -210,6 +213,7 @@ def test_trials_whose_networks_diverge_count_as_worst(
         tune(config(tmp_path / "other"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_a_training_that_ends_with_weights_that_are_no_numbers_is_a_trial_that_diverged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

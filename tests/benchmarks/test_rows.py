@@ -43,6 +43,7 @@ def test_the_table_has_a_line_for_each_number():
     assert lines[3] == "| 4,096 | 2,000 | 2,048.0 | 0.500 | 0.0 | 1,234 |"
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture):
     words = ["rows", "--num-envs", "1", "2", "--seconds", "0.01", "--checkpoint", "constant-velocity"]
     monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path / "rows.json")])

@@ -70,6 +70,7 @@ def test_every_extra_is_one_of_the_package():
     assert {command.extra for command in COMMANDS.values()} <= {"", *extras}
 
 
+@pytest.mark.slow
 def test_it_finds_modules_of_the_working_folder_and_user_errors_are_one_line(tmp_path: Path):
     """As `python -m` does; and the working folder's `envs/` hides nothing."""
     (tmp_path / "envs").mkdir()

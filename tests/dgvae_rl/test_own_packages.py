@@ -79,6 +79,7 @@ assert envs.readers.__name__ == "dgvae_rl.envs.readers"
     run(code, project)
 
 
+@pytest.mark.slow
 def test_names_of_modules_in_strings_lead_to_ours(project: Path):
     """PettingZoo factories, ids that are registered with gymnasium, lazy exports."""
     code = f"""
@@ -101,6 +102,7 @@ print(gym.spec("envpool/HighwayFast-v0").entry_point)
     ]
 
 
+@pytest.mark.slow
 def test_processes_and_pickles_find_ours(project: Path):
     code = f"""
 {OURS}

@@ -92,6 +92,7 @@ def test_an_agent_without_a_space_is_named():
 ROADS = ("highway-fast-v0", "intersection-v2", "simple_tag_v3")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "env_id", [*ROADS, "tests.envs.planted:Walk", "tests.envs.planted:Lower", "tests.envs.planted:Trembling"]
 )

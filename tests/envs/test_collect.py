@@ -66,6 +66,7 @@ def test_an_episode_depends_on_its_seed_alone():
     assert not np.array_equal(many[0].states, many[1].states)
 
 
+@pytest.mark.slow
 def test_the_store_is_the_same_for_any_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
@@ -111,6 +112,7 @@ def test_a_recording_does_not_go_on_with_a_driver_that_has_changed(
 PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "0.3", "--causal-senders", "2"]
 
 
+@pytest.mark.slow
 def test_a_perturbed_store_is_the_same_for_any_number_of_workers_and_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
@@ -285,6 +287,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_policy_of_another_env_is_one_line(
     tmp_path: Path, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):

@@ -27,6 +27,7 @@ def config(**changes: Any) -> CollectConfig:
     return CollectConfig(**{"env_id": ROAD, "out": Path("unused"), "workers": 1, "max_steps": 3, **changes})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "env_kwargs", "agents"), [(ROAD, FEW, 3), (TAG, PREY, 2)])
 def test_a_store_holds_the_changed_environment_and_says_so(
     env_id: str, env_kwargs: str, agents: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any

@@ -97,6 +97,7 @@ def summary(spec: SceneSpec, errors_m: list[float], latencies_s: list[list[float
     return summarise_episodes("here", STILL, "idle", spec, episodes, **changes)
 
 
+@pytest.mark.slow
 def test_edges_are_measured_averaged_and_cut(tmp_path: Path):
     checkpoint = save_tag(tmp_path / "tag")
     plain, result = (measure(TAG, checkpoint, horizon_steps=None, edge_ablations=on) for on in (False, True))
@@ -373,6 +374,7 @@ def test_each_pair_has_pictures(transfer_run: Run):
         assert pixels[..., :3].std() > 0.05  # something is drawn
 
 
+@pytest.mark.slow
 def test_the_command_writes_json_and_markdown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):

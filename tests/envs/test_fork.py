@@ -58,6 +58,7 @@ def run(script: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=90)
 
 
+@pytest.mark.slow
 def test_forecasters_run_in_forked_workers_of_a_threaded_parent():
     """Otherwise the workers wait for OpenMP threads that the fork did not bring along."""
     done = run(WORKERS)
@@ -65,6 +66,7 @@ def test_forecasters_run_in_forked_workers_of_a_threaded_parent():
     assert "(2, 11, 5, 2)" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", [USED_IN_A_CHILD, IMPORTED_ONLY], ids=["first use limits", "import leaves alone"])
 def test_threads_of_a_forked_child_are_limited_at_the_first_forecast_and_not_by_an_import(script: str):
     done = run(script)

@@ -22,6 +22,7 @@ from tests.envs.misbehaving import NUM_STEPS, Misbehaving, env_id
 Patch, Caught = pytest.MonkeyPatch, pytest.CaptureFixture[str]
 
 
+@pytest.mark.slow
 def test_collection_stops_at_an_environment_that_raises_and_goes_on_without_it(
     tmp_path: Path, monkeypatch: Patch, capsys: Caught
 ):
@@ -69,6 +70,7 @@ def test_an_evaluation_names_an_environment_that_dies(tmp_path: Path, monkeypatc
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_an_evaluation_of_policies_names_an_environment_that_dies(tmp_path: Path, monkeypatch: Patch, capsys: Caught):
     words = ["--env-id", env_id("Exit"), "--policy", "random", "--episodes", "2", "--num-envs", "2", "--seed", "2"]
     code, errors, _ = run_command(
@@ -79,6 +81,7 @@ def test_an_evaluation_of_policies_names_an_environment_that_dies(tmp_path: Path
     assert not multiprocessing.active_children() and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize(("kind", "num_envs", "seed"), [("Raise", 1, 3), ("NanReward", 1, 3), ("Kill", 2, 0)])
 def test_a_training_names_an_environment_that_misbehaves(

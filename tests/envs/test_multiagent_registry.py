@@ -212,6 +212,7 @@ def test_a_missing_package_of_pettingzoo_is_named(monkeypatch: pytest.MonkeyPatc
         make_multiagent_env("sisl/multiwalker_v9")
 
 
+@pytest.mark.slow
 def test_nothing_needs_mpe2_before_one_of_its_environments_is_made():
     code = (
         "import sys; sys.modules['mpe2'] = None; import envs.drivers.all_agents, envs.readers;"

@@ -30,6 +30,7 @@ def test_a_second_one_is_refused():
     second.reset(seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_collection_in_one_process_and_in_several(
     workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
@@ -41,6 +42,7 @@ def test_collection_in_one_process_and_in_several(
     assert labels == ["varied", "random", "idle", "varied", "random"]
 
 
+@pytest.mark.slow
 def test_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     arguments = ["--env-ids", ONE_ONLY, "--checkpoint", "constant-velocity", "--episodes", "3", "--workers", "2"]
     arguments += ["--horizon-steps", "2", "--num-samples", "2", "--out", str(tmp_path)]
@@ -50,6 +52,7 @@ def test_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert result["model"]["agents"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_envs", ["1", "2"])
 def test_training_of_a_policy(
     num_envs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture

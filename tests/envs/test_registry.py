@@ -153,6 +153,7 @@ def test_an_id_that_is_not_listed_has_an_entry_without_a_checkpoint():
     assert entry_for("CartPole-v1") == EnvEntry()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("door", ["envs.readers", "envs.wrappers"])  # both import envs.registry
 def test_gymnasium_environments_are_made_without_pettingzoo(door: str):
     code = f"""

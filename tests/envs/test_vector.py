@@ -77,6 +77,7 @@ SB3_KINDS: dict[str, Callable[[], VecEnv]] = {
 
 
 # Python 3.12 warns of every fork of a process with threads; that it works is what is tested.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", SB3_KINDS)
 def test_sb3_envs_are_as_if_alone(kind: str, alone: list[Played], highway_checkpoint: str):
@@ -503,6 +504,7 @@ print(VectorForecast(env, "constant-velocity").reset(seed=0)[0]["forecast"].shap
 """
 
 
+@pytest.mark.slow
 def test_gymnasium_needs_no_stable_baselines():
     done = subprocess.run([sys.executable, "-c", WITHOUT_SB3], capture_output=True, text=True, timeout=90)
     assert done.returncode == 0, done.stderr

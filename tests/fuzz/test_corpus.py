@@ -61,6 +61,7 @@ def test_without_atheris_a_line_says_how_to_install_it(monkeypatch: pytest.Monke
         run(FuzzConfig("json", 1, out=tmp_path))
 
 
+@pytest.mark.slow
 def test_the_command_says_what_is_wrong():
     done = subprocess.run([sys.executable, "-m", "tests.fuzz", "moon"], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "moon" in done.stderr and done.stderr.count("\n") == 1

@@ -498,6 +498,7 @@ def test_without_scikit_learn_labels_are_refused_before_anything_is_measured(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_smoke_without_labels_and_with_an_ego(springs: Path, tmp_path: Path):
     data, out = write_circles(tmp_path / "circles", episodes=3, steps=8, agents=3), tmp_path / "out"
     interpret(

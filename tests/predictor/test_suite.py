@@ -261,6 +261,7 @@ def test_the_line_with_a_dearer_edge_differs_in_its_price_alone():
     assert dear.set == usual.set and dear.train == usual.train | {"edge_cost": 20.0} != usual.train
 
 
+@pytest.mark.slow
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Only the line that is trained is started, in a process of its own."""
     drawn = headlines_of(monkeypatch)
@@ -278,6 +279,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     assert again["rows"] == content["rows"]
 
 
+@pytest.mark.slow
 def test_a_line_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     broken = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
     folder = line_folder(broken, line("mlp")) / "run"

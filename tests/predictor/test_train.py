@@ -94,6 +94,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, episodes: list[Epis
     return run(trainer, settings.steps)
 
 
+@pytest.mark.slow
 def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Agents that turn at a constant rate: the optimum is exact, and constant velocity is off by metres."""
     episodes = [circling_episode(seed) for seed in range(4)]
@@ -106,6 +107,7 @@ def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     assert trainer.validate()[0].min_ade_m < trainer.baseline_m / 2
 
 
+@pytest.mark.slow
 def test_following_is_learned_through_the_edge(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """On held-out episodes; the follower's future is in the ego's velocity, so only messages bring the error down."""
     episodes = [following_episode(seed) for seed in range(60)]
@@ -673,6 +675,7 @@ def reactions(tmp_path: Path) -> Path:
     return tmp_path / "reactions"
 
 
+@pytest.mark.slow
 def test_shifts_are_learned_from_branches_and_their_twins(tiny: None, reactions: Path, tmp_path: Path):
     """With a shift of 3 m a step and no other error, the loss on shifts falls; killed and resumed, it is the same."""
     settings = config(reactions, tmp_path / "run", shift_weight=3.0, steps=150, lr=1e-2)

@@ -39,6 +39,7 @@ def without_forecasts() -> VecEnv:
     return DummyVecEnv([lambda: SceneObservation(Churning(3, 0.2), reader=reader)] * ROWS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_short_soak_is_flat(name: str):
     if name == "envpool":
@@ -70,6 +71,7 @@ def planted() -> Iterator[Callable[[int], None]]:
             one.close()
 
 
+@pytest.mark.slow
 def test_planted_leaks_are_found(planted: Callable[[int], None]):
     assert run(without_forecasts(), planted) == dict.fromkeys(LIMITS, False)
 
@@ -95,6 +97,7 @@ def test_growth_is_judged_from_the_second_quarter_to_the_last():
     assert judge(samples([0, 0, 100, 100, 900, 100, 150, 150]), limits)["entries"].is_flat  # 50 are allowed
 
 
+@pytest.mark.slow
 def test_a_sample_is_of_this_process():
     before = take_sample(7)
     with open(os.devnull):

@@ -110,6 +110,7 @@ def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
     assert one.name == third.name != other.name and one.forecaster != other.forecaster
 
 
+@pytest.mark.slow
 def test_a_policy_that_drives_is_in_the_name_by_its_content(cells: Callable[..., list[Cell]], tmp_path: Path):
     path = tmp_path / "policy.zip"
 

@@ -182,6 +182,7 @@ def test_the_page_needs_nothing_else(tmp_path: Path):
     assert (tmp_path / "pictures" / "learning_curves.svg").read_text().startswith("<svg")
 
 
+@pytest.mark.slow
 def test_reports_of_equal_results_are_equal(tmp_path: Path):
     both = results() + results("two", lift=1.0)
     first = written(tmp_path / "a", both)
@@ -190,6 +191,7 @@ def test_reports_of_equal_results_are_equal(tmp_path: Path):
     assert written(tmp_path / "c", results() + results("two", lift=1.1)) != first
 
 
+@pytest.mark.slow
 def test_the_report_counts_the_runs_that_there_are(tmp_path: Path):
     assert "3 training seeds per arm" in written(tmp_path / "all", results())[0]
     assert "2 to 3 training seeds per arm" in written(tmp_path / "fewer", results()[:-1])[0]

@@ -95,6 +95,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_study_has_tables_a_report_and_a_log(whole: Path):
     assert len(results(whole)) == 5 and set(ended_cells(whole).values()) == {1}
     episodes = parquet.read_table(whole / "out" / "episodes.parquet").to_pylist()
@@ -106,6 +107,7 @@ def test_a_study_has_tables_a_report_and_a_log(whole: Path):
     assert "5 cells, 0 of them finished before" in (whole / "out" / "study.log").read_text()
 
 
+@pytest.mark.slow
 def test_finished_cells_are_not_run_again(whole: Path, monkeypatch: pytest.MonkeyPatch):
     before, report = results(whole), reports(whole)
     monkeypatch.setattr("predictor.support.jobs._started", lambda *_: pytest.fail("nothing is missing"))
@@ -113,6 +115,7 @@ def test_finished_cells_are_not_run_again(whole: Path, monkeypatch: pytest.Monke
     assert results(whole) == before and reports(whole) == report
 
 
+@pytest.mark.slow
 def test_a_study_that_was_stopped_and_killed_ends_as_one_that_was_not(whole: Path, tmp_path: Path):
     """Stopped while policies train, then killed; nothing is lost or doubled, no process stays, the report is equal."""
     text, kept = study_text(SLOW_TOY), dict[str, str]()
@@ -159,6 +162,7 @@ def test_a_signal_ends_in_one_line(
     assert signal.getsignal(number) is before
 
 
+@pytest.mark.slow
 def test_two_studies_in_one_folder_are_refused(whole: Path):
     with (whole / "out" / ".lock").open("w") as lock:
         lock.write("123")
@@ -169,6 +173,7 @@ def test_two_studies_in_one_folder_are_refused(whole: Path):
     assert run_study(config(whole, study_text(SLOW_TOY))) == 0, "the lock ends with the process that holds it"
 
 
+@pytest.mark.slow
 def test_a_damaged_result_stops_the_study_and_keeps_the_rest(whole: Path):
     before = results(whole)
     name = next(name for name in before if "random" in name)
@@ -183,6 +188,7 @@ def test_a_damaged_result_stops_the_study_and_keeps_the_rest(whole: Path):
     assert json.loads(after[name])["episodes"] == json.loads(before[name])["episodes"]
 
 
+@pytest.mark.slow
 def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     text = study_text(steps="64", selections="1")
     run = config(tmp_path, text)
@@ -208,6 +214,7 @@ def test_a_cell_that_is_killed_says_so(tmp_path: Path, capsys: pytest.CaptureFix
     assert re.search("its log is .*log.txt\n$", err)
 
 
+@pytest.mark.slow
 def test_a_result_tells_of_the_start_of_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Cells start one after another, perhaps hours later: another commit may be checked out, the file edited."""
     run = config(tmp_path, text := study_text(steps="64", selections="1", seeds="1"))
@@ -224,6 +231,7 @@ def test_a_result_tells_of_the_start_of_the_study(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "out" / "report.md").read_text().endswith(f"{text}```\n")
 
 
+@pytest.mark.slow
 def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
     """A message says to remove it where it is damaged."""
     run = config(tmp_path, study_text(steps="64", selections="1", seeds="1", references="[]"))
@@ -237,6 +245,7 @@ def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
     assert after["episodes"] == before["episodes"] and after["curve"] == [] and after["train_seconds"] == 0
 
 
+@pytest.mark.slow
 def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
     """Cells of a part are those of the whole, and a report of a part says so."""
     text = study_text(steps="64", selections="1") + f'[scenarios.longer]\nenv_id = "{TOY}"\n'
@@ -286,6 +295,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path: Path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.slow
 def test_headroom_runs_floor_and_ceiling_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arms = '["none", {name = "all", observe = "none"}, {name = "other", observe = "none"}]'
     text = study_text(arms=arms, floor='"none"', ceiling='"all"', steps="64", selections="1")

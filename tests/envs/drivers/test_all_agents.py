@@ -406,6 +406,7 @@ def test_the_nearest_pair_chooses_first():
     assert drivers._nearest_pairs(here, places[:1]).tolist() == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_pursuers_close_in_and_catch():
     env = make_multiagent_env("pursuit_v5", max_cycles=150, n_evaders=12)
     left = {}

@@ -27,6 +27,7 @@ def positions_m(env: SceneObservation | ForecastObservation) -> dict[int, np.nda
     return {int(i): s[:2] for i, s, v in zip(scene.ids, scene.states, scene.valid, strict=True) if v}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "plan"),
     [("highway-fast-v0", 1), ("merge-v1", 0), ("intersection-v2", 1), ("roundabout-v1", 0), ("racetrack-v1", 1)],

@@ -395,6 +395,7 @@ def replay(episode: Episode, env_id: str) -> list[dict[tuple[int, int], tuple[in
     return steps
 
 
+@pytest.mark.slow
 def test_labels_follow_their_agents_through_the_store_into_windows(tmp_path: Path):
     """Vehicles enter and leave this crossing; windows reorder columns and leave out who is not seen."""
     env_id = "intersection-v2"

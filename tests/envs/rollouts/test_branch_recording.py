@@ -147,6 +147,7 @@ def test_no_window_has_an_intervention_that_nobody_could_foresee():
     assert len(Windows(undisturbed, world.spec, 3, 2)) > len(windows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "settings"), [(ROAD, ON_ROAD), (TAG, IN_ARENA)])
 def test_who_is_taken_out_stays_away(env_id: str, settings: BranchRecording):
     """To the last step: mpe2 puts an agent back within the step in which its absence ends."""

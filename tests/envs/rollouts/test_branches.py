@@ -58,6 +58,7 @@ def test_what_reaches_an_agent_through_another_is_not_direct(kind: Kind):
     assert middle[5, 2, 0] == pytest.approx(whole[5, 2, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "seed"), [("intersection-v2", 900_006), ("intersection-multi-agent-v2", 900_003)])
 def test_an_intervention_that_does_nothing_moves_no_one_directly(env_id: str, seed: int):
     """Vehicles that are held lead the others to foresee the same of them as without it: their routes go on."""

@@ -53,6 +53,7 @@ def test_a_driver_in_the_place_of_the_ego_depends_on_who_is_ahead_whatever_the_p
     assert_same_scenes(played(world, 5), played(untouched, 5))  # the policy drives the world on
 
 
+@pytest.mark.slow
 def test_a_driver_in_the_place_of_the_ego_yields_at_a_crossing():
     """Policies go straight on at 9 m/s; who has the right of way makes a driver wait."""
     world = open_world("intersection-v2", "idle")

@@ -74,6 +74,7 @@ def run(env_id: str = "highway-fast-v0", episodes: int = 2, max_steps: int = 6, 
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_environment_is_measured_whatever_the_number_of_workers():
     one, two = (measure_plans(run(max_steps=14, workers=workers)) for workers in (1, 2))
     assert one == two

@@ -43,6 +43,7 @@ def tasks(kinds: list[str], seeds: list[int]) -> list[collect._Task]:
     return [collect._Task(env_id(kind), "random", seed, settings, "") for kind, seed in zip(kinds, seeds, strict=True)]
 
 
+@pytest.mark.slow
 def test_other_episodes_go_on_beside_those_that_fail():
     """Each failure stands in its own place, with environment, seed and step; no process is left."""
     kinds = [kind for kind in REASONS for _ in range(2)]
@@ -118,6 +119,7 @@ def test_errors_that_are_not_the_environments_are_never_skipped(seed: int, kind:
         list(pool.play([Plain(seed)]))
 
 
+@pytest.mark.slow
 def test_a_worker_plays_one_episode_after_the_other():
     with EpisodePool(fail, 2) as pool:
         first = list(pool.results([Plain(2), Plain(3), Plain(4)]))

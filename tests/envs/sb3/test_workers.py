@@ -35,6 +35,7 @@ MESSAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_an_environment_that_misbehaves_is_named_and_the_others_end(kind: str, capfd: pytest.CaptureFixture[str]):
     venv = WorkerVecEnv([Make("Fine"), Make(kind)], "toy-v0", timeout_s=2.0)
@@ -78,6 +79,7 @@ def test_an_answer_is_waited_for_in_steps_so_that_a_pause_costs_one_of_them():
     assert workers._comes(Quiet(looks=1), 2.5) and not workers._comes(Quiet(looks=3), 2.5)
 
 
+@pytest.mark.slow
 def test_all_processes_together_get_the_time_to_close(monkeypatch: pytest.MonkeyPatch):
     """Each takes all the time that it gets."""
     venv, clock = WorkerVecEnv([Make("Fine")] * 3, "toy-v0"), [100.0]
@@ -97,6 +99,7 @@ def test_all_processes_together_get_the_time_to_close(monkeypatch: pytest.Monkey
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_episodes_are_those_of_one_process():
     """A second episode of a seed and its reset by SB3, too."""
     makers = [Make("Fine"), Make("Raise")]

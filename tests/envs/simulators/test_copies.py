@@ -128,6 +128,7 @@ def assert_equal(found: list[Observed], expected: list[Observed]) -> None:
             np.testing.assert_array_equal(one[key], other[key], err_msg=f"step {step}: {key}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", EGO)
 def test_a_copy_of_a_running_environment_continues_exactly(name: str, way: str):
@@ -140,6 +141,7 @@ def test_a_copy_of_a_running_environment_continues_exactly(name: str, way: str):
     assert_equal(ego_steps(WAYS[way](again), 10, seed=1), expected)  # a copy of a copy, after the original went on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("env_id", MULTIAGENT)
 def test_a_copy_of_a_running_multiagent_environment_continues_exactly(env_id: str, way: str):

@@ -184,6 +184,7 @@ def test_a_driver_with_pedals_and_wheel_idles_too():
     assert (gone.speed, gone.heading) == pytest.approx((speed, heading))
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_episodes():
     first, second = HighwayParallelEnv(controlled_vehicles=3), HighwayParallelEnv(controlled_vehicles=3)
     episode = run(first, seed=5)

@@ -237,6 +237,7 @@ def test_each_mistake_is_found_and_said_in_a_line(mistake: str):
     assert all(len(line) < 400 for line in lines)
 
 
+@pytest.mark.slow
 @named()
 def test_nothing_is_found_in_the_readers_of_this_project(name: str):
     subject = SUBJECTS[name]
@@ -264,6 +265,7 @@ class Drawing(HighwayReader):
         return super().read_all(env)
 
 
+@pytest.mark.slow
 def test_a_reader_that_draws_is_found_where_a_reset_makes_new_spaces():
     """highway-env makes its action space anew at each reset: a seed of the old one must determine the actions."""
     with warnings.catch_warnings():

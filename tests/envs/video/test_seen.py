@@ -117,6 +117,7 @@ def test_closest_of_each_agent():
     assert [text.get_text() for text in ax.texts] == when
 
 
+@pytest.mark.slow
 def test_a_picture_shows_every_entry():
     """Each entry, once it is changed for one agent that is there, changes the picture; those of padding change none."""
     observation = with_plans()

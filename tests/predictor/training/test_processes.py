@@ -155,6 +155,7 @@ def apart(ours: Run, expected: Run) -> float:
     return max(losses, *(float((a - b).abs().max()) for a, b in zip(ours[1], expected[1], strict=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_several_processes_take_the_steps_of_one(crowds: Path, tmp_path: Path, kind: str):
     settings = config(crowds, tmp_path / "run", **RUNS[kind])
@@ -321,6 +322,7 @@ def large(settings: TrainConfig, **changes: Any) -> TrainConfig:
     return replace(settings, set=OPTIONS[3:], **changes)
 
 
+@pytest.mark.slow
 def test_torchrun_takes_up_a_run_and_ends_where_one_process_does(
     crowds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
