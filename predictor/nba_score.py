@@ -36,7 +36,7 @@ from predictor.forecaster import Forecaster
 from predictor.support import markdown
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
-from predictor.support.errors import run_entry_point
+from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device, tune
@@ -88,10 +88,15 @@ class NbaScoreConfig:
         """Checks ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value out of range, or a device that is not there.
+            UserError: a value out of range, noise where a single sample has none, or a device that is not there.
         """
         check_at_least(self, 1, "num_samples", "batch_size")
         check_at_least(self, 0, "max_windows", "seed")
+        if self.train_data is not None and self.num_samples == 1:
+            raise UserError(
+                "--train-data needs --num-samples of at least 2: sample 0 of constant velocity with noise has none; "
+                "leave --train-data out"
+            )
         object.__setattr__(self, "device", resolve_device(self.device))
 
 
@@ -109,7 +114,7 @@ def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
         info.spec.check_recorded(windows.spec, f"checkpoint '{name}'", f"store {config.data}")
     straight = ConstantVelocity(windows.spec, nba_protocol.HORIZON_STEPS)
     lines = [_measured("constant velocity", straight, windows, config, 1)]
-    if config.train_data is not None and config.num_samples > 1:
+    if config.train_data is not None:
         lines.append(_measured("constant velocity + noise", _noise(config.train_data, config), windows, config))
     for name, (model, _) in zip(config.checkpoint, models, strict=True):
         lines.append(_measured(name_of_folder(name), model, windows, config))

@@ -96,7 +96,8 @@ def test_some_windows_and_some_rows(store: Path):
     (line,) = measure(NbaScoreConfig(store, max_windows=5))
     assert (line.name, line.forecasts) == ("constant velocity", 50)
     assert [x.num_samples for x in measure(NbaScoreConfig(store, train_data=store, num_samples=4))] == [1, 4]
-    assert [x.name for x in measure(NbaScoreConfig(store, train_data=store, num_samples=1))] == ["constant velocity"]
+    with pytest.raises(UserError, match="--train-data needs --num-samples of at least 2"):
+        NbaScoreConfig(store, train_data=store, num_samples=1)
 
 
 def test_the_published_windows_are_recognised(store: Path):
