@@ -20,6 +20,7 @@ from envs.rollouts.moving import moving_agents
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
 from envs.rollouts.world import World
 from envs.seeding import label_rng
+from predictor.evaluation.pair_trees import pair_features
 
 EVERY = 5
 """Number of steps from one with labels to the next."""
@@ -62,6 +63,8 @@ class EdgeScene:
     where it says nothing."""
     edge_prob: dict[str, Float[np.ndarray, " pairs"]]
     """Probability of an edge of any type, by checkpoint."""
+    geometry: Float[np.ndarray, "pairs geometry"]
+    """How the two agents stand and move (`predictor.evaluation.pair_trees`)."""
     to_ego: "EdgeScene | None" = None
     """Pairs whose receiver is the ego; None without an ego."""
 
@@ -116,6 +119,7 @@ def labelled_scene(world: World, forecasters: dict[str, SideForecaster], setting
             np.linalg.norm(positions[at[0]] - positions[at[1]], axis=-1),
             None if leads is None else leads[receiver, sender],
             {name: (1 - one[at[0], at[1], 0]).astype(np.float64) for name, one in probs.items()},
+            pair_features(scene.states, scene.valid, *at, world.spec.position_dim),
         )
 
     if not world.spec.has_ego:

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from rich.console import Group
 from rich.table import Table
 
-from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
+from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, TREES, EnvGraph
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
-from predictor.reports.looks import BLACK, GREY, STYLE, YELLOW, looks_of
+from predictor.reports.looks import BLACK, GREEN, GREY, STYLE, YELLOW, looks_of
 from predictor.reports.plots import save_figure
 from predictor.reports.tables import with_interval
 from predictor.support.markdown import table
@@ -24,7 +24,7 @@ HEADS = (
     "AUC (95 %)", "average precision", "calibration error", "r with shift (95 %)", "spread over senders",
 )  # fmt: skip
 """Columns of the table."""
-RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY}
+RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY, TREES: GREEN}
 """Colors of the rules that need no network."""
 
 

@@ -1,5 +1,6 @@
 """Measures inferred edges against causal labels in one environment, beside rules that need no network."""
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -11,11 +12,13 @@ from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
 from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.side_forecasts import fitting_checkpoints
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves, score_rule
+from predictor.evaluation.pair_trees import tree_scores
 from predictor.support.errors import UserError
 from predictor.support.progress import track
 
 MAJORITY, DISTANCE, LEADERS, AHEAD = "the commoner answer", "distance", "the leader", "the vehicle ahead"
-"""Names of the rules that need no network."""
+TREES = "trees on geometry"
+"""Names of the rules that need no network; trees are fitted to the labels of the first half of the episodes."""
 EDGE = 0.5
 """Probability above which a model infers an edge."""
 
@@ -67,6 +70,8 @@ def measure_graph(run: CauseRun) -> EnvGraph:
     with run.pool(play_graph) as pool:
         episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)
+    if not _has_trees():
+        misfits = {**misfits, TREES: "they need scikit-learn: pip install 'dgvae-rl[scores]'"}
     if not next(iter(scores.values())).pairs:
         raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")
     to_ego = scores_to_ego(episodes, settings.threshold_m)
@@ -107,7 +112,16 @@ def scores_of(
     scores[DISTANCE] = score_rule(-joined([scene.distance_m for *_, scene in scenes]), pairs, None)
     if pairs.leads is not None:
         scores[leader] = score_rule(pairs.leads.astype(np.float64), pairs, EDGE)
+    if _has_trees():
+        found = tree_scores(joined([scene.geometry for *_, scene in scenes]), pairs.exists, fit)
+        if found is not None:
+            scores[TREES] = score_rule(found, pairs, EDGE, probability=True)
     return scores
+
+
+def _has_trees() -> bool:
+    """Returns whether scikit-learn is installed."""
+    return importlib.util.find_spec("sklearn") is not None
 
 
 def scores_to_ego(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> dict[str, CausalScores]:

@@ -10,7 +10,7 @@ import pytest
 from envs import evaluate
 from envs.rollouts import graph_run, reactions
 from envs.rollouts.causal_labels import IN_ARENAS
-from envs.rollouts.graph_run import DISTANCE, MAJORITY
+from envs.rollouts.graph_run import DISTANCE, MAJORITY, TREES
 from envs.rollouts.reaction_cells import ELSEWHERE
 from envs.rollouts.reactions import STRAIGHT
 from predictor.support.errors import UserError
@@ -65,7 +65,7 @@ def test_the_graph_is_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "edges by" in output and "false reaction" in output
     assert {"graph.json", "graph.md", f"{TAG}.graph.png", "reactions.json"} <= {path.name for path in out.iterdir()}
     (result,) = read_json(out / "graph.json")["results"]
-    assert list(result["scores"]) == ["tag", MAJORITY, DISTANCE]
+    assert list(result["scores"]) == ["tag", MAJORITY, DISTANCE, TREES]
     assert result["settings"]["senders"] == 1 and result["scores"]["tag"]["pairs"] > 0
     assert "| tag | " in (out / "graph.md").read_text()
 

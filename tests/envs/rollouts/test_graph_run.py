@@ -10,7 +10,16 @@ from envs.rollouts import causal_scenes, graph_run
 from envs.rollouts.causal_labels import CausalLabels, CausalSettings
 from envs.rollouts.causal_scenes import EdgeScene
 from envs.rollouts.cause_run import CauseRun
-from envs.rollouts.graph_run import AHEAD, DISTANCE, LEADERS, MAJORITY, measure_graph, scores_of, scores_to_ego
+from envs.rollouts.graph_run import (
+    AHEAD,
+    DISTANCE,
+    LEADERS,
+    MAJORITY,
+    TREES,
+    measure_graph,
+    scores_of,
+    scores_to_ego,
+)
 from envs.rollouts.world import World
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.support.errors import UserError
@@ -35,6 +44,7 @@ def scene(seed: int, leads: bool = True) -> EdgeScene:
         np.array([10.0, 30.0, 40.0, 50.0]) + rng.random(4),
         np.array([True, False, False, False]) if leads else None,
         {"right": np.array([0.9, 0.1, 0.2, 0.3]), "wrong": np.array([0.1, 0.9, 0.9, 0.9])},
+        np.array([[0.0], [1.0], [2.0], [3.0]]),
     )
 
 
@@ -47,14 +57,33 @@ def f1(scores: dict[str, CausalScores], name: str) -> float:
 def test_each_rule_is_scored_on_the_same_pairs():
     episodes = [[scene(2 * i), scene(2 * i + 1)] for i in range(6)]
     scores = scores_of(episodes, 1.0)
-    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE, LEADERS]
+    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE, LEADERS, TREES]
     assert {(s.pairs, s.episodes, s.share) for s in scores.values()} == {(24, 3, 0.25)}
-    assert [f1(scores, name) for name in scores] == [1.0, 0.0, 0.0, 1.0, 1.0]
+    assert [f1(scores, name) for name in scores] == [1.0, 0.0, 0.0, 1.0, 1.0, 0.0]  # 24 pairs are too few for a tree
     majority = scores[MAJORITY]
     assert majority.accuracy is not None and majority.accuracy.value == 0.75
     assert majority.auc is not None and majority.auc.value == 0.5
     assert scores[DISTANCE].bound == pytest.approx(-20.0, abs=3.0)
     assert scores["right"].bins and not scores[DISTANCE].bins
+
+
+def test_trees_see_the_geometry_of_the_first_half_and_are_scored_on_the_second():
+    episodes = [[scene(4 * i + k) for k in range(4)] for i in range(20)]
+    found = scores_of(episodes, 1.0)[TREES]
+    assert f1(scores_of(episodes, 1.0), TREES) == 1.0
+    assert found.episodes == 10 and found.bins, "their score is a probability"
+    swapped = [[replace(one, geometry=one.geometry[::-1]) for one in steps] for steps in episodes[10:]]
+    assert f1(scores_of(episodes[:10] + swapped, 1.0), TREES) == 0.0, "what they saw is not what follows"
+
+
+def test_without_scikit_learn_the_trees_are_left_out_and_the_reason_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(causal_scenes, "causal_labels", quick_labels)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    found = measure_graph(run(save_tag(tmp_path / "tag")))
+    assert list(found.scores) == ["tag", MAJORITY, DISTANCE]
+    assert found.misfits == {TREES: "they need scikit-learn: pip install 'dgvae-rl[scores]'"}
 
 
 def test_receivers_of_different_steps_are_apart():
@@ -91,7 +120,7 @@ def test_edges_to_the_ego_are_scored_apart():
         if to_ego is not None
     ]
     scores = scores_to_ego(episodes, 1.0)
-    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE, AHEAD]
+    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE, AHEAD, TREES]
     assert {(s.pairs, s.episodes, s.share) for s in scores.values()} == {(24, 3, 0.25)}
     assert f1(scores, "right") == f1(scores, AHEAD) == 1.0
     assert f1(scores_to_ego(swapped, 1.0), "right") == 0.0
@@ -101,7 +130,7 @@ def test_edges_to_the_ego_are_scored_apart():
 def test_without_a_known_label_the_edges_to_the_ego_have_no_score():
     assert scores_to_ego([[scene(0)], [scene(1)]], 1.0) == {}
     none = np.zeros(0)
-    nobody = EdgeScene(none, none.astype(int), none, none.astype(bool), {"right": none})
+    nobody = EdgeScene(none, none.astype(int), none, none.astype(bool), {"right": none}, np.zeros((0, 1)))
     assert scores_to_ego([[replace(scene(0), to_ego=nobody)]], 1.0) == {}
 
 
@@ -124,7 +153,7 @@ def test_an_environment_is_measured_whatever_the_number_of_workers(tmp_path: Pat
     checkpoint = save_tag(tmp_path / "tag")
     one, three = (measure_graph(run(checkpoint, workers=workers)) for workers in (1, 3))
     assert one == three
-    assert list(one.scores) == ["tag", MAJORITY, DISTANCE]
+    assert list(one.scores) == ["tag", MAJORITY, DISTANCE], "the first half, one episode, has one answer alone"
     found = one.scores["tag"]
     assert found.pairs > 10 and found.auc is not None and found.calibration_error is not None
     assert (one.settings.horizon_s, one.settings.threshold_m) == (1.0, 0.05)
