@@ -127,8 +127,8 @@ class EvaluateConfig:
     """Largest number of episodes that --reactions plays in each environment to find so many."""
     graph: bool = False
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
-    agent brakes or is taken out), beside distance, "the leader" and the commoner answer, in --episodes episodes:
-    graph.json, graph.md and a figure per environment under --out."""
+    agent brakes or is taken out), beside distance, "the leader", the commoner answer and trees on geometry (with
+    scikit-learn), in --episodes episodes: graph.json, graph.md and a figure per environment under --out."""
     plans: bool = False
     """Whether to measure, instead of accuracy, what-if forecasts: each plan of the ego is played in copies of the
     simulator at every fifth step of --episodes episodes. plans.json, plans.md and a figure per environment under
