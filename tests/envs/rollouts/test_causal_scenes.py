@@ -56,8 +56,10 @@ def test_pairs_stand_beside_their_own_probability_distance_and_leader():
     np.testing.assert_array_equal(receivers, found.receiver)
     ids = list(labels.ids)
     places = {int(i): state[:2] for i, state in zip(untouched.ids, untouched.states, strict=True)}
-    for receiver, sender, shift_m, distance_m in zip(receivers, senders, found.shift_m, found.distance_m, strict=True):
+    columns = zip(receivers, senders, found.shift_m, found.distance_m, found.geometry, strict=True)
+    for receiver, sender, shift_m, distance_m, geometry in columns:
         assert shift_m == labels.shift_m[ids.index(receiver), ids.index(sender)]
+        np.testing.assert_array_equal(geometry[:2], places[sender] - places[receiver])
         assert distance_m == pytest.approx(np.linalg.norm(places[receiver] - places[sender]))
     assert set(zip(receivers, senders, strict=True)) == {(r, s) for r in (1, 2, 3, 4) for s in range(5) if r != s}
     assert found.leads is not None

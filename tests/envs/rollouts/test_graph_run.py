@@ -83,6 +83,7 @@ def test_without_scikit_learn_the_trees_are_left_out_and_the_reason_is_told(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     found = measure_graph(run(save_tag(tmp_path / "tag")))
     assert list(found.scores) == ["tag", MAJORITY, DISTANCE]
+    assert TREES not in scores_of([[scene(4 * i + k) for k in range(4)] for i in range(20)], 1.0)
     assert found.misfits == {TREES: "they need scikit-learn: pip install 'dgvae-rl[scores]'"}
 
 
