@@ -102,13 +102,15 @@ def _better(
 ) -> int | None:
     """Returns the id whose agent should be there and as fast, if it is not there itself.
 
-    An agent that ran into a slower one is where that one should be, too, and pushed it away; it is faster.
+    An agent that ran into a slower one is where that one should be, too, and pushed it away; it is faster, or the other
+    one is not far off its own course.
     """
     rows = second.index_of
     for other, number in enumerate(first.ids.tolist()):
         if other == row or rule.error(first.states[other], new) > max(0.1 * error, 2 * rule.typical_m):
             continue
-        elsewhere = number not in rows or rule.error(first.states[other], second.states[rows[number]]) > rule.handed_m
+        least = max(rule.handed_m, 0.5 * error)
+        elsewhere = number not in rows or rule.error(first.states[other], second.states[rows[number]]) > least
         axes = slice(rule.axes, 2 * rule.axes)
         changes = [float(np.linalg.norm(new[axes] - first.states[each][axes])) for each in (other, row)]
         if elsewhere and changes[0] <= max(0.5 * changes[1], 2 * rule.typical_m / abs(rule.step_s)):
