@@ -16,7 +16,7 @@ RAMMED_AND_SLOWER = (
     ((204.51, 4.0, 29.34, 0.0), (226.68, 2.91, 11.43, 0.0)),
     ((212.24, 4.28, 14.59, -0.73), (224.23, 4.99, 6.18, -0.19)),
 )
-"""The same of highway-fast-v0, seed 330,072: the first is then about as fast as the second was, and where it should be."""
+"""Seed 330,072 of highway-fast-v0: the first is then about as fast as the second was, and where it should be."""
 Pair = tuple[tuple[tuple[float, ...], ...], ...]
 SPEC = HIGHWAY_SPEC
 
