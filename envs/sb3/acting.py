@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecTransposeImage
 
 from envs.own_observation import carries_forecasts, space_without_added, without_added
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
@@ -79,7 +81,7 @@ class ActingTeam:
         spaces = {agent: self._seen_space(env.observation_space(agent)) for agent in learners}
         self.actions: dict[str, gym.Space] = {agent: env.action_space(agent) for agent in learners}
         self._padded = PaddedObservation(spaces, roles_of(spaces, self.actions), None)
-        if self._padded.space != wanted:
+        if space_as_stored(self._padded.space) != wanted:
             raise UserError(f"{source} was trained on {_line(wanted)}, but the env gives {_line(self._padded.space)}")
         self._fresh = ActingPolicy(policy)
         self._acting: dict[str, ActingPolicy] = {}
@@ -102,6 +104,18 @@ class ActingTeam:
 
     def _seen_space(self, space: gym.Space) -> gym.Space:
         return space_without_added(space) if self._strips else space
+
+
+def space_as_stored(space: gym.Space) -> gym.Space:
+    """Returns the space that a policy has which was trained on another one: Stable-Baselines3 puts channels first.
+
+    A policy takes observations of either; it moves the axes of images itself.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({key: space_as_stored(part) for key, part in space.items()})
+    if isinstance(space, gym.spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+        return VecTransposeImage.transpose_space(space)
+    return space
 
 
 def _line(space: gym.Space) -> str:

@@ -3,16 +3,19 @@
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from pettingzoo import ParallelEnv
 from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, MultiagentArena
+from agents.policy import load_policy
 from agents.runs import save_model
 from agents.task import Task
 from agents.vec_envs import make_multiagent_venv
@@ -20,7 +23,8 @@ from agents.video import record_task
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
-from envs.sb3.acting import ActingPolicy
+from envs.sb3.acting import ActingPolicy, ActingTeam, space_as_stored
+from predictor.support.errors import UserError
 from tests.agents.helpers import STEERING
 
 SPREAD = "simple_spread_v3"
@@ -150,3 +154,75 @@ def test_a_film_shows_the_episode_that_was_measured(
     monkeypatch.setattr("agents.video.record_multiagent_episode", play)
     record_task(task, model, 5, 100)
     assert shown == driven(str(tmp_path / "policy.zip"), task)(5)[0]
+
+
+PHOTO = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+STATE = gym.spaces.Box(-1, 1, (4,), np.float32)
+SPACES = {
+    "photo": PHOTO,
+    "channels first": gym.spaces.Box(0, 255, (3, 36, 40), np.uint8),
+    "no photo": gym.spaces.Box(0, 1, (36, 40, 3), np.float32),
+    "state": STATE,
+    "both": gym.spaces.Dict({"photo": PHOTO, "state": STATE}),
+}
+PHOTOS = (SPACES["photo"], SPACES["channels first"])
+
+
+class Seeing(gym.Env):
+    """Shows noise of any kind."""
+
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self, space: gym.Space) -> None:
+        self.observation_space = space
+        space.seed(0)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+class Watchers(ParallelEnv):
+    """Two agents that see images."""
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "watchers"}
+    possible_agents: ClassVar[list[str]] = ["a", "b"]
+    agents = possible_agents
+
+    def observation_space(self, agent: str) -> gym.Space:
+        return PHOTO
+
+    def action_space(self, agent: str) -> gym.Space:
+        return gym.spaces.Discrete(3)
+
+
+def untrained(env: gym.Env) -> PPO:
+    space = env.observation_space
+    kind = "MultiInputPolicy" if isinstance(space, gym.spaces.Dict) else "CnnPolicy" if space in PHOTOS else "MlpPolicy"
+    return PPO(kind, env, n_steps=4, batch_size=4, seed=0, device="cpu")
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_a_policy_drives_where_it_was_trained_whatever_it_sees(name: str, tmp_path: Path):
+    env = Seeing(SPACES[name])
+    model = untrained(env)
+    assert space_as_stored(env.observation_space) == model.observation_space
+    model.save(tmp_path / "policy.zip")
+    policy, loaded = load_policy(tmp_path / "policy.zip", env)
+    observation, _ = loaded.reset(seed=0)
+    assert policy(observation) == model.predict(observation, deterministic=True)[0]
+
+
+def test_a_policy_that_sees_other_images_is_refused(tmp_path: Path):
+    untrained(Seeing(PHOTO)).save(tmp_path / "policy.zip")
+    other = Seeing(gym.spaces.Box(0, 255, (40, 36, 3), np.uint8))
+    with pytest.raises(UserError, match=r"was trained on Box\(0, 255, \(3, 36, 40\).*gives Box\(0, 255, \(40, 36, 3\)"):
+        load_policy(tmp_path / "policy.zip", other)
+
+
+def test_a_team_sees_images():
+    team = ActingTeam(untrained(Seeing(PHOTO)), Watchers(), (), "policy photo")
+    seen = {agent: PHOTO.sample() for agent in Watchers.possible_agents}
+    assert team(seen).keys() == seen.keys()
