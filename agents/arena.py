@@ -23,7 +23,7 @@ from agents.vec_envs import (
 )
 from envs.drivers.all_agents import has_heuristic, make_driver
 from envs.readers.base import role_of
-from envs.sb3.acting import ActingPolicy
+from envs.sb3.acting import ActingPolicy, space_as_stored
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
 from predictor.support.errors import UserError, short
@@ -84,7 +84,7 @@ def _acting(policy: BaseAlgorithm, venv: VecEnv) -> ActingPolicy:
         UserError: it was trained on observations or actions of other sizes.
     """
     for what in ("observation", "action"):
-        trained, found = (_parts(getattr(of, f"{what}_space")) for of in (policy, venv))
+        trained, found = (_parts(space_as_stored(getattr(of, f"{what}_space"))) for of in (policy, venv))
         for key in dict.fromkeys((*trained, *found)):
             own, here = trained.get(key), found.get(key)
             if own is None or here is None or _sizes(own) != _sizes(here):
@@ -101,8 +101,7 @@ def _parts(space: gym.Space) -> Mapping[str, gym.Space]:
 
 
 def _sizes(space: gym.Space) -> Any:
-    """Returns the sizes of a space, whatever the order of its axes: Stable-Baselines3 moves those of images."""
-    return int(space.n) if isinstance(space, gym.spaces.Discrete) else sorted(space.shape or ())
+    return int(space.n) if isinstance(space, gym.spaces.Discrete) else space.shape
 
 
 def open_arena(task: Task, num_envs: int, in_process: bool | None = None) -> Arena:

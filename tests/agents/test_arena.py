@@ -173,7 +173,7 @@ class _Film(gym.Env):
         return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)
 
 
-def test_a_policy_that_sees_images_is_played():
+def test_a_policy_that_sees_images_is_played(monkeypatch: pytest.MonkeyPatch):
     """Stable-Baselines3 moves the axes of an image's space."""
     gym.register("Film-v0", _Film)
     try:
@@ -184,6 +184,11 @@ def test_a_policy_that_sees_images_is_played():
         assert policy.observation_space.shape == (3, 36, 40)
         arena = open_arena(task, 1)
         assert [result.length for result in arena.play(policy, [0])] == [3]
+        monkeypatch.setattr(_Film, "observation_space", gym.spaces.Box(0, 255, (40, 36, 3), np.uint8))
+        other = open_arena(task, 1)
+        with pytest.raises(UserError, match=r"\(3, 36, 40\).*got .*\(3, 40, 36\)"):
+            other.play(policy, [0])
+        other.close()
         arena.close()
     finally:
         del gym.registry["Film-v0"]
