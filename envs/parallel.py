@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
@@ -217,6 +218,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         source = f"scene reader of {self._source}"
         scene = check_multiagent_scene(self._reader.read(self.env), self._reader.spec, source)
         require_indexed(scene, required, source)
+        # a reader may give the simulator's own arrays, into which the next reset writes
+        scene = replace(scene, scene=scene.scene.copy(), heading_rad=np.array(scene.heading_rad))
         if self.stream.config.arm.shown.true_futures:
             horizon_steps = self.stream.horizon_steps
             xy_m = all_keeping_on(self.env, self._reader, scene.scene, observations, self._last_actions, horizon_steps)

@@ -104,7 +104,9 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         self._layout = ObservationLayout(own_part(space), self.stream.spaces(), flatten)
         self.single_observation_space = self._layout.space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        # Gymnasium before 1.4 writes the mode into metadata that all environments of a class share.
+        told = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        self._mode = getattr(base, "autoreset_mode", told)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
         self._entries: Observations = {}
 

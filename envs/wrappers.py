@@ -169,8 +169,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         name, spec = f"scene reader of '{self.scene_source}'", self.reader.spec
         scene = require_scene(self.reader.read(self.env), name)
         scene.check(name, spec, agents=spec.max_agents)
-        self._scene = scene
-        return {**own_entries(obs), **scene_entries(scene)}
+        self._scene = scene.copy()  # a reader may give the simulator's own arrays, into which the next reset writes
+        return {**own_entries(obs), **scene_entries(self._scene)}
 
 
 class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

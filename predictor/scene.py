@@ -163,6 +163,10 @@ class Scene:
     heading_rad: float = 0.0
     """Heading of the ego, which turns world axes into ego axes; 0 where agents have none."""
 
+    def copy(self) -> "Scene":
+        """Returns the scene with arrays of its own."""
+        return Scene(self.states.copy(), self.ids.copy(), self.valid.copy(), self.heading_rad)
+
     def behind_absent(self, agents: int) -> "Scene":
         """Returns the scene behind `agents` absent ones, for a forecaster with an ego where no agent is the ego."""
         return Scene(

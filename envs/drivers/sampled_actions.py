@@ -31,7 +31,7 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
     if isinstance(space, gym.spaces.Box) and space.is_bounded():
         if np.issubdtype(space.dtype, np.integer):
             return rng.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
-        return rng.uniform(space.low, space.high).astype(space.dtype)
+        return np.asarray(rng.uniform(space.low, space.high), dtype=space.dtype)
     require_space(space, "the action space")
     raise UserError(f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}")
 

@@ -1,6 +1,6 @@
 """Interface of plan models, and what they return."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
 from types import SimpleNamespace
@@ -148,7 +148,7 @@ def _with_arrays(plans: Any, source: str) -> SimpleNamespace:
     for name in ("states", "rewards", "crash_rewards", "crashed"):
         if given[name] is not None:
             try:
-                given[name] = np.asarray(given[name])
+                given[name] = np.array(given[name])  # a copy: a model may fill one array again
             except ValueError as error:
                 raise UserError(f"{source}: {name} must be an array: {error}") from error
     for name in ("actions", "later_actions"):
@@ -171,7 +171,9 @@ def _length(actions: Any) -> int:
 
 
 def _equal(one: Any, other: Any) -> bool:
-    """Returns whether two actions are equal; those of Tuple spaces part by part."""
+    """Returns whether two actions are equal; those of Tuple and Dict spaces part by part."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_equal(one[key], other[key]) for key in one)
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(map(_equal, one, other))
     return np.array_equal(one, other)

@@ -50,7 +50,7 @@ def random_actions(
             if np.issubdtype(space.dtype, np.integer):
                 actions[agent] = generator.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
             else:
-                actions[agent] = generator.uniform(space.low, space.high).astype(space.dtype)
+                actions[agent] = np.asarray(generator.uniform(space.low, space.high), dtype=space.dtype)
         else:
             raise UserError(
                 f"partner 'random' needs Discrete or bounded Box actions, agent '{agent}' has {space}; pass a callable"

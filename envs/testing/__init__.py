@@ -13,6 +13,7 @@ from envs.readers.base import MakeReader
 from envs.testing.asking import ReaderProblem, check_reset
 from envs.testing.ego import ego_problems, replay_problems
 from envs.testing.motion import lasting_share
+from envs.testing.names import name_problems, obedience_problems
 from envs.testing.playing import open_reader, play, shown_spaces, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
@@ -85,6 +86,8 @@ def examine_reader(
         problems += observation_problems(played, shown_spaces(env))
         if opened.spec.has_ego:
             problems += ego_problems(env, opened, seed)
+        else:
+            problems += name_problems(played) + obedience_problems(env, opened, seed)
         problems += replay_problems(env, opened, seed)
     except ReaderProblem as error:
         return Examined([*problems, str(error)])

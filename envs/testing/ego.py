@@ -4,7 +4,8 @@ By other actions from the same state it shows, too, whether the others' states a
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -27,8 +28,8 @@ def ego_problems(env: Any, opened: OpenReader, seed: int) -> list[str]:
 
     Both need an environment that seeds determine.
     """
-    actions = _actions(env.action_space)
-    ends = [found for number in range(SEEDS) if (found := _ends(env, opened, seed + number, actions)) is not None]
+    acts = [partial(_always, action) for action in extreme_actions(env.action_space)]
+    ends = [found for number in range(SEEDS) if (found := ends_of(env, opened, seed + number, acts)) is not None]
     return _obeys_another(ends, opened.spec) or _relative(ends, opened.spec)
 
 
@@ -40,7 +41,7 @@ def _obeys_another(played: Sequence[Ends], spec: SceneSpec) -> list[str]:
     votes: list[int] = []
     own = strongest = 0.0
     for ends in played:
-        effect = _spread(ends[0], spec)
+        effect = spread(ends[0], spec)
         if effect.max() > ALIKE:
             votes.append(int(effect.argmax()))
             own, strongest = max(own, effect[0]), max(strongest, effect.max())
@@ -71,26 +72,37 @@ def _relative(played: Sequence[Ends], spec: SceneSpec) -> list[str]:
     return []
 
 
-def _actions(space: gym.Space) -> list[Any]:
+def _always(action: Any, env: Any) -> Any:
+    return action
+
+
+def extreme_actions(space: gym.Space) -> list[Any]:
     """Returns actions that differ as much as they can."""
     if isinstance(space, gym.spaces.Discrete):
         return [int(space.start) + i for i in range(min(int(space.n), MAX_ACTIONS))]
     if isinstance(space, gym.spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
-        middle = ((space.low + space.high) / 2).astype(space.dtype)
+        middle = (space.low / 2 + space.high / 2).astype(space.dtype)
         return [space.low.copy(), middle, space.high.copy()]
     space.seed(0)
     return [space.sample() for _ in range(MAX_ACTIONS)]
 
 
-def _ends(env: Any, opened: OpenReader, seed: int, actions: Sequence[Any]) -> Ends | None:
-    """Returns what each action leads to if it is taken in the first steps; None without a replay."""
+def ends_of(env: Any, opened: OpenReader, seed: int, acts: Sequence[Callable[[Any], Any]]) -> Ends | None:
+    """Returns what each driver leads to in the first steps; None without a replay.
+
+    Args:
+        env: the environment.
+        opened: its reader.
+        seed: seed of all resets.
+        acts: drivers, each of which takes the environment and returns the action.
+    """
     ends: Ends = [[] for _ in range(ACTED_STEPS)]
     begins = []
-    for action in actions:
+    for act in acts:
         begin(env, opened, seed)
         begins.append(opened.read(env))
         for after in ends:
-            *_, over = step(env, opened, action)
+            *_, over = step(env, opened, act(env))
             after.append(_by_first_row(begins[-1], opened.read(env)))
             if over:
                 break
@@ -109,7 +121,7 @@ def _same(one: Moment, other: Moment) -> bool:
     return one.states.shape == other.states.shape and bool(np.allclose(one.states, other.states, rtol=0, atol=ALIKE))
 
 
-def _spread(ends: Sequence[dict[int, Any]], spec: SceneSpec) -> Any:
+def spread(ends: Sequence[dict[int, Any]], spec: SceneSpec) -> Any:
     """Returns how far each agent's state depends on the action, in units of its scale."""
     effect = np.zeros(1 + max((row for end in ends for row in end), default=0))
     used = 2 * spec.position_dim

@@ -31,6 +31,8 @@ class Moment:
     """Identities."""
     heading_rad: float
     """Heading of the ego."""
+    named: Mapping[str, int] = field(default_factory=dict)
+    """Id of each agent that a reader names; nothing where there is an ego."""
 
     @property
     def index_of(self) -> dict[int, int]:
@@ -48,6 +50,8 @@ class Episode:
     """Observations of each agent, by its name, from the reset on; of an ego, whose name is empty."""
     rewards: list[Mapping[str, Any]] = field(default_factory=list)
     """Rewards of each step, likewise."""
+    living: list[list[str]] = field(default_factory=list)
+    """Names of the agents that live, from the reset on; nothing where there is an ego."""
 
     def pairs(self) -> Iterator[tuple[Moment, Moment]]:
         """Yields each moment with the one that follows it."""
@@ -82,17 +86,20 @@ class OpenReader:
 
     def _all(self, env: Any) -> Moment:
         try:
+            index_of: Mapping[str, int] = {}
             if self.spec.has_ego:
                 self._check_view(self.reader.read(env))
                 scene = require_scene(self.reader.read_all(env), self.name)
                 scene.check(self.name, self.spec)
             else:
-                scene = check_multiagent_scene(self.reader.read(env), self.spec, self.name).scene
+                several = check_multiagent_scene(self.reader.read(env), self.spec, self.name)
+                scene, index_of = several.scene, several.index_of
         except Exception as error:
             kind = "" if isinstance(error, UserError) else f"{self.name}: reading failed with {type(error).__name__}: "
             raise ReaderProblem(_line(f"{kind}{error}")) from error
         there = scene.valid
-        return Moment(scene.states[there].copy(), scene.ids[there].copy(), float(scene.heading_rad))
+        named = {name: int(scene.ids[index]) for name, index in index_of.items()}
+        return Moment(scene.states[there].copy(), scene.ids[there].copy(), float(scene.heading_rad), named)
 
     def _check_view(self, view: Scene) -> None:
         spec = self.spec
@@ -224,13 +231,18 @@ def play(env: Any, opened: OpenReader, seed: int, max_steps: int) -> Episode:
     def by_agent(seen: Any) -> Mapping[str, Any]:
         return deepcopy(dict(seen) if isinstance(env, ParallelEnv) else {"": seen})  # some write into old observations
 
+    def living() -> list[str]:
+        return list(env.agents) if isinstance(env, ParallelEnv) else []
+
     episode.shown.append(by_agent(begin(env, opened, seed)))
     episode.moments.append(opened.read(env))
+    episode.living.append(living())
     for number in range(max_steps):
         observation, reward, over = step(env, opened, act(number))
         episode.shown.append(by_agent(observation))
         episode.rewards.append(by_agent(reward))
         episode.moments.append(opened.read(env))
+        episode.living.append(living())
         if over:
             break
     return episode

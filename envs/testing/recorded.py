@@ -107,7 +107,7 @@ def _no_numbers(episodes: Sequence[Episode]) -> list[str]:
 
 
 def _outside(episodes: Sequence[Episode], spaces: Mapping[str, Any]) -> list[str]:
-    """Finds an observation that is not in its space; another type of number is no mistake, it is converted."""
+    """Finds an observation that is not in its space; another type of number is no mistake if it can be converted."""
     for episode in episodes:
         for time, shown in enumerate(episode.shown):
             for agent, seen in shown.items():
@@ -131,6 +131,8 @@ def _misfit(seen: Any, space: Any) -> str:
     if isinstance(space, gym.spaces.Box):
         if np.shape(seen) != space.shape:
             return f" has the shape {np.shape(seen)}, its space {space.shape}"
+        if np.issubdtype(space.dtype, np.integer) and np.asarray(seen).dtype.kind == "f":
+            return f" has numbers of type {np.asarray(seen).dtype}, its space {space.dtype}, which would cut them"
         values, low, high = (np.asarray(part, dtype=np.float64) for part in (seen, space.low, space.high))
         slack = 1e-5 * (1 + np.abs(values))
         out = (values < low - slack) | (values > high + slack)

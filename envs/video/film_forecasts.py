@@ -18,8 +18,7 @@ from envs.readers.highway import is_highway_env
 from envs.readers.outcomes import outcome_keys
 from envs.video.drawing import AgentOverlay, OverlayStyle, View, draw_overlay
 from envs.video.files import decode_png, encode_png, write_video
-from envs.video.highway import forecast_shown, large_viewer
-from envs.wrappers import ForecastObservation
+from envs.video.highway import forecast_shown, large_viewer, with_forecasts
 from predictor.support.errors import UserError
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -77,7 +76,7 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         """Draws nothing yet."""
         super().__init__(env)
-        self._forecasts = _with_forecasts(env)
+        self._forecasts = with_forecasts(env, "FilmForecasts draws")
         self._draw = draw or view_of(env)
         self._outcomes = outcome_keys(env, crash_key)
         if self._draw is None and not is_highway_env(env):
@@ -158,16 +157,6 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
         time_s = self._steps * float(self.get_wrapper_attr("scene_spec").dt_s)
         text = f"{name}   t = {time_s:.1f} s   reward {self._reward:+.2f}   return {self._return:.2f}"
         return text + ("   crashed" if self._crashed else "")
-
-
-def _with_forecasts(env: gym.Env) -> ForecastObservation:
-    """Returns the `ForecastObservation` among the wrappers of an environment."""
-    found: Any = env
-    while not isinstance(found, ForecastObservation):
-        if not isinstance(found, gym.Wrapper):
-            raise UserError("FilmForecasts draws the forecasts of a ForecastObservation; wrap the env in one first")
-        found = found.env
-    return found
 
 
 @dataclass

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 from highway_env.envs.common.graphics import EnvViewer
 from jaxtyping import Float, UInt8
@@ -147,7 +148,7 @@ class Recording:
 
 
 def record_episode(
-    env: ForecastObservation,
+    env: gym.Env,
     act: Callable[[Any], Any],
     *,
     seed: int = 0,
@@ -157,21 +158,23 @@ def record_episode(
     """Plays one episode and records it for drawing.
 
     Args:
-        env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation`; with
-            `what_if`, the plans of the ego and the forecasts for each are drawn instead of those without a plan.
+        env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation` and, as
+            one likes, in other wrappers around it; with `what_if`, the plans of the ego and the forecasts for each are
+            drawn instead of those without a plan.
         act: function from its observation to an action.
         seed: seed of the reset.
         max_steps: largest number of policy steps.
         num_samples: number of futures drawn for each agent, whatever the policy sees; the likelier, the more opaque.
 
     Raises:
-        UserError: not a highway-env environment, or one that cannot be rendered to arrays.
+        UserError: not a highway-env environment, one without a `ForecastObservation`, or one that cannot be rendered
+            to arrays.
     """
     if not is_highway_env(env):
         raise UserError(f"videos need a highway-env environment, got {env.unwrapped.__class__.__name__}")
     if env.render_mode != "rgb_array":
         raise UserError(f"videos need an env made with render_mode='rgb_array', got {env.render_mode!r}")
-    recorder = _Recorder(env, num_samples, OverlayStyle())
+    recorder = _Recorder(with_forecasts(env, "record_episode draws"), num_samples, OverlayStyle())
     try:
         obs, _ = env.reset(seed=seed)
         recorder.begin()
@@ -248,6 +251,24 @@ class _Recorder:
     def _note_forecast(self) -> None:
         frame = len(self.recording._frames)
         self.recording._steps.append(forecast_shown(self._env, self._samples, frame))
+
+
+def with_forecasts(env: gym.Env, draws: str) -> ForecastObservation:
+    """Returns the `ForecastObservation` among the wrappers of an environment.
+
+    Args:
+        env: the environment.
+        draws: name of what draws and "draws", for the message.
+
+    Raises:
+        UserError: there is none.
+    """
+    found: Any = env
+    while not isinstance(found, ForecastObservation):
+        if not isinstance(found, gym.Wrapper):
+            raise UserError(f"{draws} the forecasts of a ForecastObservation; wrap the env in one first")
+        found = found.env
+    return found
 
 
 def forecast_shown(env: ForecastObservation, num_samples: int, frame: int) -> _Step:

@@ -86,6 +86,26 @@ class MultiagentStyle:
 
 
 @dataclass
+class _Seen:
+    """Extent and roles of the moments so far; each is looked at once, also in a film that is drawn while it runs."""
+
+    count: int = 0
+    extent_m: Float[np.ndarray, "2 axes"] | None = None
+    roles: set[str] = field(default_factory=set)
+
+    def after(self, moments: list[Moment]) -> "_Seen":
+        bodies = [body for moment in moments[self.count :] for body in moment.bodies.values()]
+        self.count = len(moments)
+        self.roles |= {body.role for body in bodies}
+        if bodies:
+            places, radii = np.array([body.now_m for body in bodies]), np.array([[body.radius_m] for body in bodies])
+            ends = [places - radii, places + radii, *([] if self.extent_m is None else self.extent_m[:, None])]
+            found = np.concatenate(ends)
+            self.extent_m = np.stack([found.min(axis=0), found.max(axis=0)])
+        return self
+
+
+@dataclass
 class MultiagentRecording:
     """Played episode, which can be drawn."""
 
@@ -105,6 +125,7 @@ class MultiagentRecording:
     """Roles of the environment's named agents, those that have not come yet included."""
     _focus_id: int = -1
     _moments: list[Moment] = field(default_factory=list)
+    _seen: _Seen = field(default_factory=_Seen)
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
@@ -156,9 +177,8 @@ class MultiagentRecording:
     @property
     def extent_m(self) -> Float[np.ndarray, "2 axes"]:
         """Lowest and highest coordinates of all agents at all steps so far."""
-        bodies = [body for moment in self._moments for body in moment.bodies.values()]
-        places, radii = np.array([body.now_m for body in bodies]), np.array([[body.radius_m] for body in bodies])
-        return np.stack([(places - radii).min(axis=0), (places + radii).max(axis=0)])
+        extent_m = self._seen.after(self._moments).extent_m
+        return np.zeros((2, 2)) if extent_m is None else extent_m
 
     @cached_property
     def _arena(self) -> Arena:
@@ -173,7 +193,7 @@ class MultiagentRecording:
     @property
     def roles_seen(self) -> set[str]:
         """Roles of all agents at all steps so far."""
-        return {body.role for moment in self._moments for body in moment.bodies.values()}
+        return self._seen.after(self._moments).roles
 
     def colors_of(self, roles: set[str]) -> dict[str, Color]:
         """Returns the colour of each role."""

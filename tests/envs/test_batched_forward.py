@@ -11,9 +11,11 @@ import pytest
 
 from envs.batched_forward import can_share
 from envs.parallel import ForecastParallelEnv, batch_forwards
+from envs.readers.base import MultiagentScene
 from envs.sb3 import agents_as_rows
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.scene import Scene
 from predictor.support.errors import ProtocolError
 from tests.envs.helpers import assert_same, tiny_model
 from tests.envs.test_parallel import WORLD, Life, Toy, ToyReader, act, wrap
@@ -230,3 +232,55 @@ def test_what_cannot_share_forecasts_by_itself():
     derived = [Own(Toy(), reader=ToyReader, forecaster=tiny_model(WORLD)) for _ in range(2)]
     assert batch_forwards(derived) is None
     assert batch_forwards([Toy(), Toy()]) is None
+
+
+class InPlace(Vectors):
+    """Keeps all states in one array, into which each step and reset writes."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        count = len(self.lives)
+        self.full = MultiagentScene(
+            Scene(np.zeros((count, 4)), np.arange(count), np.ones(count, np.bool_)),
+            {name: i for i, name in enumerate(self.lives) if self.lives[name].learns},
+            np.zeros(count),
+        )
+
+    def _observations(self) -> Any:
+        self.full.scene.states[:] = self.tracks[self.t]
+        self.full.heading_rad[:] = self.headings[self.t]
+        return super()._observations()
+
+
+class GivesTheSimulators:
+    """Hands over the simulator's own arrays."""
+
+    def __init__(self, env: Any) -> None:
+        self.spec = replace(WORLD, max_agents=len(env.unwrapped.lives))
+
+    def reset(self) -> None:
+        """Numbers are places."""
+
+    def read(self, env: Any) -> MultiagentScene:
+        full: MultiagentScene = env.unwrapped.full
+        return full
+
+
+class GivesCopies(GivesTheSimulators):
+    def read(self, env: Any) -> MultiagentScene:
+        return deepcopy(super().read(env))
+
+
+def test_the_last_observation_is_of_its_episode_when_the_simulator_writes_in_place():
+    """A copy is reset before the others have stepped, so before the scene that closed its episode is forecast."""
+    lives = {"one": Life(last=9), "other": Life(last=9), "traffic": Life(learns=False, last=9)}
+
+    def played(reader: Any) -> list[Any]:
+        makers = [lambda: ForecastParallelEnv(InPlace(lives), "constant-velocity", reader=reader)] * 2
+        venv = ParallelVecEnv(makers)
+        venv.seed(0)
+        venv.reset()
+        return play(venv)
+
+    found, expected = played(GivesTheSimulators), played(GivesCopies)
+    assert_same_sequences(found, expected)

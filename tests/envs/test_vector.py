@@ -201,6 +201,20 @@ def test_disabled_partial_reset_right_after_reset(alone: list[Played], highway_c
         assert_same(one_of(again, i), alone[i].steps[1])
 
 
+def test_the_mode_is_that_of_the_environment_whatever_others_of_its_class_have(
+    alone: list[Played], highway_checkpoint: str
+):
+    """Gymnasium before 1.4 writes it into metadata that all environments of a class share."""
+    inner = SyncVectorEnv(MAKERS, autoreset_mode=AutoresetMode.SAME_STEP)
+    inner.metadata = inner.metadata | {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    env = VectorForecast(RecordEpisodeStatistics(inner), highway_checkpoint)
+    env.reset(seed=SEED)
+    for t in range(STEPS):
+        obs, *_ = env.step(ACTIONS[t])
+        for i, played in enumerate(alone):
+            assert_same(one_of(obs, i), played.successors[t] if played.ends[t] else played.steps[t])
+
+
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
 def test_gymnasium_observations_lie_in_the_space(mode: AutoresetMode, highway_checkpoint: str):
     env = vector(mode, highway_checkpoint, num_samples=2)

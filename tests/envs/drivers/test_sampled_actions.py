@@ -15,3 +15,10 @@ def test_whole_numbers_are_drawn_equally_often_up_to_both_bounds(low: int, high:
     values, counts = np.unique(drawn, return_counts=True)
     assert values.tolist() == list(range(low, high + 1))
     assert counts.min() > 0.75 * drawn.size / len(values)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_number_without_axes_is_drawn_too(dtype: type):
+    space, rng = gym.spaces.Box(-1, 1, (), dtype), np.random.default_rng(0)
+    drawn = [uniform_action(space, rng, "drivers") for _ in range(3)]
+    assert all(space.contains(each) for each in drawn) and len({float(each) for each in drawn}) == 3

@@ -292,3 +292,22 @@ def test_actions_without_plans_are_refused():
         plan_model_for(env)
     with pytest.raises(UserError, match="HighwayPlans needs a highway-env environment, got Blank"):
         HighwayPlans(Blank())
+
+
+def test_plans_keep_what_a_model_writes_over():
+    buffer = np.zeros((2, 3, 4))
+    plans = checked_plans(TwoPlans(given(buffer, (0, 1), rewards=buffer[..., 0])), Blank(), 3, 4)
+    buffer += 1
+    assert not plans.states.any() and plans.rewards is not None and not plans.rewards.any()
+
+
+def test_actions_may_be_dicts_of_arrays():
+    def actions(push: float) -> tuple[Any, ...]:
+        return {"push": np.zeros(2), "turn": 1}, {"push": np.full(2, push), "turn": 1}
+
+    model = TwoPlans(given(np.zeros((2, 3, 4)), actions(1.0)))
+    model.actions = actions(1.0)  # type: ignore[attr-defined]
+    assert checked_plans(model, Blank(), 3, 4).actions[1]["turn"] == 1
+    model.actions = actions(2.0)  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match="its attribute actions must be those of its plans"):
+        checked_plans(model, Blank(), 3, 4)

@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from envs.registry import make_env
 from envs.testing import check_reader, examine_reader, reader_problems
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
-from tests.envs.semantics import DT_S, SUBJECTS, Crowd, Swarm, SwarmReader, named, read_crowd
+from tests.envs.semantics import DT_S, LIVES, SUBJECTS, Crowd, Swarm, SwarmReader, named, read_crowd
 
 SPEC = SceneSpec(dt_s=DT_S, feature_scales=(10.0, 10.0, 1.0, 1.0), perception_m=1000.0)
 
@@ -373,3 +374,82 @@ def test_spaces_of_another_package_are_found_and_refused():
         uniform_action(OldSpace(), np.random.default_rng(0), "drivers")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="the own observation space of 'it' must be a space of gymnasium, got"):
         own_spaces(OldSpace(), "'it'")  # type: ignore[arg-type]
+
+
+class Nameless(SwarmReader):
+    """Names nobody from a step on."""
+
+    def __init__(self, env: Any, first_step: int = 0) -> None:
+        super().__init__(env)
+        self.first_step = first_step
+
+    def read(self, env: Any) -> Any:
+        seen = super().read(env)
+        return replace(seen, index_of=seen.index_of if env.unwrapped.time < self.first_step else {})
+
+
+class Renumbered(SwarmReader):
+    """Gives everybody another id in the middle of the episode."""
+
+    def read(self, env: Any) -> Any:
+        seen = super().read(env)
+        shift = 100 if env.unwrapped.time >= 5 else 0
+        return replace(seen, scene=replace(seen.scene, ids=np.where(seen.scene.valid, seen.scene.ids + shift, -1)))
+
+
+class Swapped(SwarmReader):
+    """Gives each name the place of the next agent."""
+
+    def read(self, env: Any) -> Any:
+        seen = super().read(env)
+        names, places = list(seen.index_of), list(seen.index_of.values())
+        return replace(seen, index_of=dict(zip(names, np.roll(places, -1).tolist(), strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("reader", "sentence"),
+    [
+        (Nameless, "index_of must have the index of each agent that lives, but lacks ["),
+        (partial(Nameless, first_step=2), "] in step 2; its names are []; the view of an agent without one would be"),
+        (Renumbered, "lives on in step 5, but its id changes from "),
+        (Swapped, "each name must have the index of its own agent"),
+    ],
+)
+def test_names_that_go_wrong_are_found(reader: Any, sentence: str):
+    assert reader_problems(Swarm(), SwarmReader) == []
+    problems = reader_problems(Swarm(), reader)
+    assert any(sentence in line for line in problems), problems
+    assert all(len(line) < 400 for line in problems)
+
+
+def test_obedience_is_told_of_the_agents_own_name():
+    *_, line = reader_problems(Swarm(), Swapped)
+    first, second = [name for name, life in LIVES.items() if life.learns and life.first == 0][:2]
+    assert line.startswith(f"the actions of '{first}' move what index_of calls '"), line
+    assert f"calls '{first}'" not in line and second in LIVES
+
+
+class Cut(Pushed):
+    """Shows floats in a space of whole numbers, which cuts them."""
+
+    def __init__(self, floats: bool) -> None:
+        super().__init__(shift_m=40.0)
+        self.observation_space = gym.spaces.Box(0, 255, (2,), np.uint8)
+        self.floats = floats
+
+    def _seen(self, found: Any) -> Any:
+        number = 1 + self.time % 50
+        return np.full(2, number + 0.5) if self.floats else np.full(2, number, np.int64), *found[1:]
+
+    def reset(self, **options: Any) -> Any:
+        return self._seen(super().reset(**options))
+
+    def step(self, action: np.ndarray) -> Any:
+        return self._seen(super().step(action))
+
+
+def test_floats_in_a_space_of_whole_numbers_are_found():
+    reader = FunctionReader(read_crowd, SPEC)
+    assert reader_problems(Cut(floats=False), reader) == []
+    (line,) = reader_problems(Cut(floats=True), reader)
+    assert "has numbers of type float64, its space uint8, which would cut them, in step 0" in line

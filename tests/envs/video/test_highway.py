@@ -3,6 +3,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 import pytest
@@ -215,3 +216,18 @@ def test_a_risky_plan_is_red_and_a_safe_one_green():
     blank = Image.new("RGB", (200, 100))
     drawn = draw_overlay(blank, View((0.0, -50.0), 1.0), (0.0, 0.0), [], "", style, [plan]).reshape(-1, 3)
     assert (drawn == style.risky_color).all(-1).sum() > 300
+
+
+def test_wrappers_around_the_forecasts_are_no_matter(env: ForecastObservation, recording: Recording):
+    action = idle_action(env)
+    outside = gym.wrappers.TimeLimit(env, max_episode_steps=2)
+    again = record_episode(outside, lambda obs: action, seed=1, max_steps=STEPS)
+    assert again.num_steps == 2
+    np.testing.assert_array_equal(again._steps[0].forecast_m, recording._steps[0].forecast_m)
+
+
+def test_an_environment_without_forecasts_is_refused():
+    env = make_env("highway-fast-v0", render_mode="rgb_array")
+    with pytest.raises(UserError, match="record_episode draws the forecasts of a ForecastObservation; wrap the env"):
+        record_episode(env, lambda obs: 0)
+    env.close()
