@@ -24,7 +24,7 @@ from predictor.scene import SceneSpec
 from predictor.scene_checks import MOST_STEPS
 from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
 from predictor.support.errors import UserError, short
-from predictor.support.files import check_place, new_folder, write_json
+from predictor.support.files import check_place, new_folder, told_of, write_json
 from predictor.support.hub import fetch, hub_name, is_hub
 from predictor.support.reading import MIB, NoSuchFile, check_regular, read_json, version_of
 from predictor.support.remote import address, is_remote, kept_copy, named
@@ -76,17 +76,26 @@ class CheckpointInfo:
 
 
 def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
-    """Writes a checkpoint folder; an existing one is replaced only when the new one is complete."""
+    """Writes a checkpoint folder; an existing one is replaced only when the new one is complete and can be read.
+
+    Raises:
+        UserError: the network is of another kind than `info` says, or a checkpoint may not hold its weights or `info`.
+    """
     if name_of(model) != info.model:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
     with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
         (partial / WEIGHTS).write_bytes(save(tensors))  # `save_file` would not follow the umask
         write_json(partial / CONFIG, {"format": FORMAT, "version": VERSION, **asdict(info)})
+        with told_of(path, partial):
+            read_info(partial)
+            read_weights(partial / WEIGHTS, {key: tuple(tensor.shape) for key, tensor in tensors.items()})
 
 
 def resolve(name: str | Path) -> Path:
     """Returns the folder of a checkpoint: a shipped one by its name, a folder itself, or the best one of a run folder.
+
+    A folder of a shipped name comes first if it holds a checkpoint.
 
     Of a folder on another file system (`s3://…`) it returns a copy, which is kept until the process ends. One on a hub
     is downloaded, once in a process.
@@ -105,11 +114,12 @@ def resolve(name: str | Path) -> Path:
             raise UserError(f"{address(path)} is not a predictor checkpoint (it has no {' and '.join(MOST_BYTES)})")
         return found
     check_place(path)
-    if path.is_dir():
-        best = path / BEST_OF_RUN
-        return best if (best / WEIGHTS).is_file() and not (path / WEIGHTS).is_file() else path
-    if str(name) in shipped():
+    best = path / BEST_OF_RUN
+    holds, holds_best = (path / WEIGHTS).is_file(), (best / WEIGHTS).is_file()
+    if str(name) in shipped() and not (holds or holds_best):  # a folder may be called "highway"
         return PRETRAINED / str(name)
+    if path.is_dir():
+        return best if holds_best and not holds else path
     if is_own(name):
         raise UserError(f"'{name}' is a forecaster of your own and no checkpoint; pass one with weights")
     raise UserError(
@@ -129,7 +139,9 @@ def name_of_folder(path: str | Path) -> str:
     if is_hub(path):
         return hub_name(path).repository.rpartition("/")[2]
     path = Path(path)
-    if path.parent.name == "snapshots":  # a download in the cache: models--OWNER--NAME/snapshots/COMMIT
+    if path.parent.name == "snapshots" and path.parent.parent.name.startswith(
+        "models--"
+    ):  # a download in the cache: models--OWNER--NAME/snapshots/COMMIT
         return path.parent.parent.name.rpartition("--")[2]
     # not resolve(), which raises where links lead in a circle
     named = Path(os.path.realpath(path)) if path.name in ("", ".", "..", BEST_OF_RUN) else path

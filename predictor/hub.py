@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from predictor.checkpoint import (
+    BEST_OF_RUN,
     CARD,
     CONFIG,
     MOST_CARD_BYTES,
@@ -20,7 +21,8 @@ from predictor.checkpoint import (
 from predictor.reports.tables import MODEL_NAMES
 from predictor.support.errors import UserError
 from predictor.support.hub import PREFIX, hub_name, is_hub, push
-from predictor.support.reading import read_text
+from predictor.support.reading import NoSuchFile, read_text
+from predictor.support.remote import is_remote
 
 _HEADER = "---\nlibrary_name: dgvae-rl\ntags:\n- trajectory-prediction\n- dgvae-rl\n---\n\n"
 
@@ -40,13 +42,23 @@ def push_to_hub(checkpoint: str | Path, repository: str, private: bool = False) 
         raise UserError(f"{checkpoint} is on a hub already; push a folder")
     _, info = load_checkpoint(checkpoint)  # what is not whole is not shared
     folder = resolve(checkpoint)
-    card = folder / CARD
-    text = read_text(card, MOST_CARD_BYTES) if card.is_file() else card_of(name_of_folder(checkpoint), repository, info)
+    text = _card(checkpoint, folder) or card_of(name_of_folder(checkpoint), repository, info)
     if not text.startswith("---"):
         text = _HEADER + text
     content: dict[str, bytes | Path] = {name: folder / name for name in (CONFIG, WEIGHTS)}
     content[CARD] = text.encode()
     return push(folder, repository, private, f"Checkpoint {name_of_folder(checkpoint)}", content)
+
+
+def _card(checkpoint: str | Path, folder: Path) -> str:
+    """Returns the card of a checkpoint; empty without one. Of an address, `folder` is a copy of the other files."""
+    places = [folder] if not is_remote(checkpoint) else [Path(checkpoint), Path(checkpoint) / BEST_OF_RUN]
+    for place in places:
+        try:
+            return read_text(place / CARD, MOST_CARD_BYTES)
+        except NoSuchFile:
+            continue
+    return ""
 
 
 def from_hub(name: str, device: str = "cpu") -> tuple[Any, CheckpointInfo]:

@@ -298,6 +298,11 @@ class OnlineForecaster:
         local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
         check_states(local)
         axes = len(self._ego_axes)
+        if self._ego_axes.any() and (valid.any(axis=1) & ~valid[:, 0]).any():
+            raise UserError(
+                "a forecaster with the frame 'ego' needs the ego, agent 0, in every scene that has agents, but it is "
+                "not valid; take a forecaster with another frame where there is no ego"
+            )
         origins = local[:, 0, :axes] * self._ego_axes
         local[..., :axes] -= origins[:, None]
         states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)

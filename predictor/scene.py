@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from predictor.graph import to_dense
-from predictor.support.config_checks import check_types
+from predictor.support.config_checks import check_types, make_plain
 from predictor.support.errors import UserError, short, some
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
@@ -56,6 +56,7 @@ class SceneSpec:
     def __post_init__(self) -> None:
         """Checks that the fields fit together."""
         check_types(self)
+        make_plain(self)
         if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
         if self.feature_names[:4] != KINEMATIC_FEATURES and self.feature_names[:6] != KINEMATIC_FEATURES_3D:

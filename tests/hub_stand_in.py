@@ -32,6 +32,10 @@ class Hub:
     """Sizes that the hub claims of files, in place of the true ones."""
     silent: threading.Event = field(default_factory=threading.Event)
     """Set while the hub takes connections and answers nothing."""
+    broken: set[str] = field(default_factory=set)
+    """Names of files whose transfer breaks off."""
+    page: bytes | None = None
+    """What every question is answered with, as by a login page in the hub's place."""
     released: threading.Event = field(default_factory=threading.Event)
     """Set at the end, so that no request waits any longer."""
 
@@ -84,6 +88,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.hub.silent.is_set():
             self.hub.released.wait(60)
             return
+        if self.hub.page is not None:
+            return self._answer(200, self.hub.page, Content_Type="text/html")
         path = self.path.partition("?")[0]
         if found := re.fullmatch(r"/api/models/([^/]+/[^/]+)(?:/revision/(.+))?", path):
             self._info(found[1], found[2] or "main")
@@ -108,6 +114,10 @@ class _Handler(BaseHTTPRequestHandler):
         content = self.hub.repositories[repository][sha].get(name) if sha else None
         if sha is None or content is None:
             return self._refuse("EntryNotFound" if sha else "RepoNotFound")
+        if name in self.hub.broken:
+            self.close_connection = True
+            self.connection.close()
+            return
         etag = f'"{hashlib.sha1(content).hexdigest()}"'
         self._answer(200, content, ETag=etag, X_Repo_Commit=sha, Accept_Ranges="none")
 

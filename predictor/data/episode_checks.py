@@ -9,6 +9,9 @@ from predictor.scene import LARGEST, SceneSpec
 from predictor.support.config_checks import MOST_PARTS
 from predictor.support.errors import UserError, short
 
+MOST_ID = int(np.iinfo(np.int64).max)
+"""Largest id and seed of a store, whose numbers have 64 bits."""
+
 
 def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
     """Checks types and shapes of an episode's states, presence, ids, labels and marks of interventions.
@@ -29,8 +32,8 @@ def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
     ):
         array = arrays[name]
         if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or array.ndim != axes:
-            got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else short(repr(array), 60)
-            raise UserError(f"{where}: {name} of an episode must be an array of {wanted} with {axes} axes, got {got}")
+            wanted = f"an array of {wanted} with {axes} axes"
+            raise UserError(f"{where}: {name} of an episode must be {wanted}, got {_kind(array)}")
     states, valid, ids = arrays["states"], arrays["valid"], arrays["ids"]
     assert states is not None and valid is not None and ids is not None
     if not len(states) or states.shape[:2] != valid.shape or states.shape[1] != len(ids):
@@ -41,21 +44,32 @@ def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
     if states.shape[2] != spec.num_features:
         wanted = f"{spec.num_features} features {spec.feature_names}"
         raise UserError(f"{where}: states need {wanted}, got {states.shape[2]}")
-    if (ids < 0).any() or len(np.unique(ids)) != len(ids):
-        raise UserError(f"{where}: ids of an episode must be different and not negative, got {short(ids.tolist())}")
+    if (ids < 0).any() or (ids > MOST_ID).any() or len(np.unique(ids)) != len(ids):
+        wanted = f"different, not negative, and at most {MOST_ID}"
+        raise UserError(f"{where}: ids of an episode must be {wanted}, got {short(ids.tolist())}")
+    seed, label = getattr(episode, "seed", 0), getattr(episode, "label", "")
+    if not isinstance(seed, int | np.integer) or not -MOST_ID <= seed <= MOST_ID:
+        raise UserError(f"{where}: the seed of an episode must be a whole number of 64 bits, got {short(seed, 60)}")
+    if not isinstance(label, str):
+        raise UserError(f"{where}: the label of an episode must be a text, got {short(repr(label), 60)}")
     for name, kinds, axes in (("edge_types", "iu", 3), ("edge_attributes", "f", 4), ("causal_shift_m", "f", 3)):
         labels = getattr(episode, name, None)
         if labels is None:
             continue
-        if labels.dtype.kind not in kinds or labels.ndim != axes or labels.shape[1:3] != (len(ids), len(ids)):
+        fits = isinstance(labels, np.ndarray) and labels.dtype.kind in kinds and labels.ndim == axes
+        if not fits or labels.shape[1:3] != (len(ids), len(ids)):
             wanted = f"{'integers' if 'i' in kinds else 'floating point'} for each pair of the {len(ids)} agents"
-            raise UserError(f"{where}: {name} of an episode must be {wanted}, got {labels.dtype} {labels.shape}")
+            raise UserError(f"{where}: {name} of an episode must be an array of {wanted}, got {_kind(labels)}")
         check_label_values(name, labels, where)
     marks = getattr(episode, "perturbed", None)
-    if marks is not None and (marks.dtype.kind not in "iu" or marks.shape != valid.shape):
-        raise UserError(
-            f"{where}: perturbed of an episode must be integers of shape {valid.shape}, got {marks.dtype} {marks.shape}"
-        )
+    fits = isinstance(marks, np.ndarray) and marks.dtype.kind in "iu" and marks.shape == valid.shape
+    if marks is not None and not fits:
+        wanted = f"an array of integers of shape {valid.shape}"
+        raise UserError(f"{where}: perturbed of an episode must be {wanted}, got {_kind(marks)}")
+
+
+def _kind(given: Any) -> str:
+    return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else short(repr(given), 60)
 
 
 def check_label_values(name: str, labels: np.ndarray, where: str) -> None:
@@ -66,7 +80,7 @@ def check_label_values(name: str, labels: np.ndarray, where: str) -> None:
         fine, wanted = np.isfinite(labels), "be finite"
     else:
         fine, wanted = (
-            np.isnan(labels) | (labels >= 0) & (labels <= LARGEST),
+            np.isnan(labels) | (labels >= 0) & (labels <= np.float64(LARGEST)),
             f"lie between 0 and {LARGEST:g}, or be NaN",
         )
     if not fine.all():

@@ -34,7 +34,7 @@ from predictor.data.store_files import (
 from predictor.scene import PADDING_ID, Scene, SceneSpec
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
-from predictor.support.files import check_place, new_folder
+from predictor.support.files import check_place, new_folder, plain, told_of
 from predictor.support.locks import locked_path
 from predictor.support.reading import version_of
 from predictor.support.remote import address, exists, is_remote, local_copy
@@ -193,9 +193,12 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
             "causal_threshold_m": info.causal_threshold_m,
             CONTENT: arrays.content.hexdigest(),
         }
-        text = json.dumps(attributes, default=str, ensure_ascii=False)
-        plain = json.loads(text.encode("utf-8", "replace").decode())  # a label may be the name of a file, no UTF-8
-        group.attrs.update(plain | {DIGEST: digest_of(plain)})
+        text = json.dumps(attributes, default=plain, ensure_ascii=False)
+        written = json.loads(text.encode("utf-8", "replace").decode())  # a label may be the name of a file, no UTF-8
+        group.attrs.update(written | {DIGEST: digest_of(written)})
+        with told_of(path, partial):
+            header = read_header(partial, FORMAT)
+            _checked_labels(partial, header, _info(partial, header))
 
 
 def read_store(path: Path) -> EpisodeStore:
@@ -351,7 +354,12 @@ def _padded_labels(
             raise UserError(f"{where}: edge_types and edge_attributes need equal numbers of steps in each episode")
         if name == "edge_attributes":
             check_widths(labels, names, where)
-        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], np.result_type(*labels))
+        kind = np.result_type(*labels)
+        if name != "edge_types":
+            kind = np.result_type(kind, np.float32)  # what is read: not half of it
+        elif kind.kind == "u":
+            kind = np.dtype(np.int16)
+        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], kind)
         for label, begin in zip(labels, starts[:-1], strict=True):
             joined[begin : begin + len(label), : label.shape[1], : label.shape[2]] = label
         padded[name] = joined

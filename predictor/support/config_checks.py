@@ -67,6 +67,16 @@ def check_types(config: Any) -> None:
             raise UserError(f"{name} must be {wanted}, got {short(repr(value), 60)}")
 
 
+def make_plain(config: Any) -> None:
+    """Turns NumPy's numbers among the fields of a config, also within tuples, into Python's, which JSON holds."""
+    for field in fields(config):
+        value = getattr(config, field.name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, np.generic) for number in numbers):
+            made = tuple(number.item() if isinstance(number, np.generic) else number for number in numbers)
+            object.__setattr__(config, field.name, made if isinstance(value, tuple) else made[0])
+
+
 @cache
 def _simple_fields(config_class: Any) -> dict[str, tuple[type, ...]]:
     """Returns the types of the fields that have simple ones only."""

@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_use, cannot_write, short
 from predictor.support.remote import is_remote, require_local, uploaded
 
@@ -71,6 +73,15 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def told_of(path: Path, partial: Path) -> Iterator[None]:
+    """Lets the errors of a block name the place that is written to, not the unfinished folder."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{str(error).replace(str(partial), str(path))}; nothing was written") from error
+
+
+@contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
     with disk_errors_of(path):
@@ -102,8 +113,13 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes JSON; values without a JSON type are written as strings."""
-    write_text(path, json.dumps(content, indent=2, default=str) + "\n")
+    """Writes JSON; NumPy's numbers as numbers, other values without a JSON type as strings."""
+    write_text(path, json.dumps(content, indent=2, default=plain) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """Returns what JSON holds of a value without a JSON type: a number of NumPy's, or a text."""
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def finite(content: Any) -> Any:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from predictor.support.errors import UserError, short
+from predictor.support.errors import DISK_ERRORS, UserError, short
+from predictor.support.files import write_text
 
 PREFIX = "hub:"
 """Beginning of the name of a folder on a hub, where a checkpoint or a policy is expected."""
@@ -90,15 +91,15 @@ def fetch(name: str | Path, files: Mapping[str, int], optional: Mapping[str, int
     absent = [file for file in files if file not in sizes]
     if absent:
         raise UserError(f"{wanted} has no {absent[0]} and is not what is asked for; there are {_some(sizes)}")
-    folders = set()
-    for file, most in (dict(files) | {file: most for file, most in (optional or {}).items() if file in sizes}).items():
+    limits = dict(files) | {file: most for file, most in (optional or {}).items() if file in sizes}
+    for file, most in limits.items():
         if sizes[file] is None or sizes[file] > most:
             raise UserError(f"{wanted}: {file} is too large: at most {most:,} bytes, the hub says {sizes[file]}")
-        with _errors_of(wanted, hub):
-            folders.add(Path(_download(hub, wanted, file)).parent)
-    if {folder.name for folder in folders} != {info.sha}:
-        raise UserError(f"{wanted} was changed while it was downloaded; try again, or name a commit behind an @")
-    return folders.pop()
+    commit = HubName(wanted.repository, str(info.sha))
+    with _errors_of(wanted, hub):
+        folder = {Path(_download(hub, commit, file)).parent for file in limits}.pop()
+    _note_commit(folder, wanted.revision or "main")
+    return folder
 
 
 def push(folder: Path, repository: str, private: bool, message: str, content: Mapping[str, bytes | Path]) -> str:
@@ -161,6 +162,16 @@ def _cached(wanted: HubName, hub: Any, files: Mapping[str, int], reason: _NoNetw
     return found.pop()
 
 
+def _note_commit(snapshot: Path, revision: str) -> None:
+    """Notes in the cache that a branch or tag is at this commit, for later use without a network; all files are there.
+
+    The package notes it before the first file arrives; a download that breaks off then hides the older copy.
+    """
+    note = snapshot.parent.parent / "refs" / revision
+    if revision != snapshot.name:
+        write_text(note, snapshot.name)
+
+
 @contextmanager
 def _errors_of(wanted: HubName, hub: Any, pushed: str = "") -> Iterator[None]:
     """Turns errors of the hub into one sentence."""
@@ -187,6 +198,19 @@ def _errors_of(wanted: HubName, hub: Any, pushed: str = "") -> Iterator[None]:
         raise _NoNetwork(f"cannot reach {endpoint()} for {wanted}") from error
     except (HTTPError, InvalidURL, known.OfflineModeIsEnabled) as error:
         raise _NoNetwork(f"cannot reach {endpoint()} for {wanted} ({_reason(error)})") from error
+    except UserError:
+        raise
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(
+            f"{endpoint()} does not answer as a hub does ({_reason(error)}); check HF_ENDPOINT, and whether a login "
+            "page or a proxy answers in its place"
+        ) from error
+    except OSError as error:
+        if error.errno in DISK_ERRORS:
+            raise
+        raise UserError(
+            f"{where} could not be downloaded ({_reason(error)}); try again, or check HF_HUB_CACHE"
+        ) from error
 
 
 @contextmanager

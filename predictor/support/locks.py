@@ -9,6 +9,7 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from predictor.support.errors import UserError
@@ -17,7 +18,17 @@ from predictor.support.remote import is_remote, require_local
 LOCK_FILE = ".lock"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of file systems without locks; there, nothing is locked."""
-_held: dict[str, int] = {}
+
+
+@dataclass
+class _Held:
+    """Lock that this process holds."""
+
+    descriptor: int
+    holders: int = 0
+
+
+_held: dict[str, _Held] = {}
 
 
 @contextlib.contextmanager
@@ -63,22 +74,19 @@ def _made(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def _held_file(file: Path, problem: str, other: str) -> Iterator[None]:
     key = os.path.abspath(file)
-    if key in _held:
-        _held[key] += 1
-        try:
-            yield
-        finally:
-            _held[key] -= 1
-        return
-    descriptor = _taken(file, problem, other)
+    if key not in _held:
+        _held[key] = _Held(_taken(file, problem, other))
+    held = _held[key]
+    held.holders += 1
     try:
-        _held[key] = 1
         yield
     finally:
-        _held.pop(key, None)
-        with contextlib.suppress(OSError):
-            file.unlink()
-        os.close(descriptor)
+        held.holders -= 1
+        if not held.holders:  # of several threads the last one to leave
+            _held.pop(key, None)
+            with contextlib.suppress(OSError):
+                file.unlink()
+            os.close(held.descriptor)
 
 
 def _taken(file: Path, problem: str, other: str) -> int:

@@ -5,7 +5,6 @@ as any other file from strangers. What is written is made whole on the local dis
 the project knows of these file systems. A `Path` keeps an address with one slash fewer ("s3:/bucket/store").
 """
 
-import atexit
 import errno
 import os
 import re
@@ -14,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,8 @@ _PACKAGES = {
 }  # fmt: skip
 _LOCAL = ("file", "local")
 _CHUNK = 2**22
-_COPIES: dict[str, tuple[list[str], Path]] = {}
-"""Copies that are kept until the process ends: address to state of the files and folder."""
+_COPIES: dict[str, tuple[list[str], Path, Path, int]] = {}
+"""Copies that are kept until the process ends: address to state of the files, folder, the folder around it, process."""
 
 
 def is_remote(path: str | Path) -> bool:
@@ -143,7 +143,7 @@ def named(copy: Path, path: str | Path) -> Iterator[None]:
 def kept_copy(path: Path, files: Mapping[str, int]) -> Path | None:
     """Returns a folder with copies of some files of another file system; None if one is not there.
 
-    It is kept until the process ends, and made anew when the files have changed.
+    It is kept until the process ends, or until the files have changed: it is then made anew.
 
     Args:
         path: address of the folder that has the files.
@@ -166,18 +166,21 @@ def kept_copy(path: Path, files: Mapping[str, int]) -> Path | None:
     kept = _COPIES.get(address(path))
     if kept is None or kept[0] != state:
         # names in tables are those of the last two folders
-        copy = Path(tempfile.mkdtemp(dir=_folder_of_copies())).joinpath(*path.parts[1:][-2:])
+        root = Path(tempfile.mkdtemp(dir=_folder_of_copies()))
+        copy = root.joinpath(*path.parts[1:][-2:])
         for name, size in sizes.items():
             _copy(system, f"{key}/{name}", copy / name, size, path)
-        kept = _COPIES[address(path)] = (state, copy)
+        if kept is not None and kept[3] == os.getpid():  # the process that forked this one may read its own
+            shutil.rmtree(kept[2], ignore_errors=True)
+        kept = _COPIES[address(path)] = (state, copy, root, os.getpid())
     return kept[1]
 
 
 @cache
 def _folder_of_copies() -> str:
     """Returns a folder that this process deletes at its end."""
-    folder, process = tempfile.mkdtemp(prefix="dgvae-rl-"), os.getpid()
-    atexit.register(lambda: shutil.rmtree(folder, ignore_errors=True) if os.getpid() == process else None)
+    folder = tempfile.mkdtemp(prefix="dgvae-rl-")
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)  # atexit does not run in forked processes
     return folder
 
 

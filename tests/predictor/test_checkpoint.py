@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -489,3 +490,53 @@ def test_a_link_to_itself_has_a_name_and_is_refused_where_it_is_read(tmp_path: P
     assert name_of_folder(loop) == name and names_of([str(loop)]) == {str(loop): name}
     with pytest.raises(UserError, match=called):
         load_checkpoint(loop)
+
+
+# --- Names and places -------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_without_a_checkpoint_hides_no_shipped_one(
+    monkeypatch: pytest.MonkeyPatch, path: Path, tmp_path: Path
+):
+    monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
+    monkeypatch.chdir(tmp_path / "toy")
+    Path("toy").mkdir()
+    assert resolve("toy") == path, "a folder for recordings"
+    with pytest.raises(UserError, match="toy is not a predictor checkpoint"):
+        load_checkpoint("./toy")
+    save_checkpoint(Path("toy"), made(1), INFO)
+    assert resolve("toy") == Path("toy")
+    assert_holds(Path("toy"), made(1))
+
+
+def test_only_the_cache_of_a_hub_has_names_in_front_of_snapshots():
+    assert name_of_folder("cache/models--me--merge/snapshots/5f6d877b") == "merge"
+    assert name_of_folder("runs/exp/snapshots/100") == "100"
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path: Path):
+    info = replace(INFO, horizon_steps=np.int64(4), std_m=tuple(np.float32([0.1, 0.25, 0.5, 0.7])))
+    save_checkpoint(tmp_path / "toy", made(), info)
+    assert load_checkpoint(tmp_path / "toy")[1].std_m == pytest.approx((0.1, 0.25, 0.5, 0.7))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda network: network.double(),
+            r"/toy/model.safetensors: tensor '.*' must be float32 \(F32\), got F64; noth",
+        ),
+        (
+            lambda network: network.decoder.readout.bias.data.fill_(np.nan),
+            "'decoder.readout.bias' is not finite; train",
+        ),
+    ],
+)
+def test_weights_that_no_one_can_load_replace_nothing(path: Path, spoil: Callable[[Any], object], message: str):
+    spoilt = made(1)
+    spoil(spoilt)
+    with pytest.raises(UserError, match=message):
+        save_checkpoint(path, spoilt, INFO)
+    assert_holds(path, made())
+    assert [each.name for each in path.parent.iterdir()] == ["toy"]

@@ -156,3 +156,48 @@ def test_without_the_extra_one_sentence_says_how_to_get_it(monkeypatch: pytest.M
     for act in (lambda: resolve("hub:me/merge"), lambda: push_to_hub("merge", "me/merge")):
         with pytest.raises(UserError, match=r"need the package huggingface_hub; pip install 'dgvae-rl\[hub\]'"):
             act()
+
+
+def test_an_update_that_breaks_off_leaves_the_copy_before_usable(hub: Hub, monkeypatch: pytest.MonkeyPatch):
+    hub.commit("me/merge", **shipped_files())
+    folder = resolve("hub:me/merge")
+    files = shipped_files()
+    hub.commit("me/merge", config__json=files["config__json"] + b"\n", model__safetensors=files["model__safetensors"])
+    hub.broken.add("model.safetensors")
+    checkpoint._fetched.cache_clear()
+    with pytest.raises(UserError):
+        resolve("hub:me/merge")
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    assert resolve("hub:me/merge") == folder
+
+
+def test_the_latest_whole_copy_serves_without_a_network(hub: Hub, monkeypatch: pytest.MonkeyPatch):
+    hub.commit("me/merge", **shipped_files())
+    first = resolve("hub:me/merge")
+    files = shipped_files()
+    hub.commit("me/merge", config__json=files["config__json"] + b"\n", model__safetensors=files["model__safetensors"])
+    checkpoint._fetched.cache_clear()
+    second = resolve("hub:me/merge")
+    checkpoint._fetched.cache_clear()
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    assert resolve("hub:me/merge") == second != first
+
+
+@pytest.mark.parametrize("answer", [b"<html>please log in</html>", b"[]"])
+def test_a_page_in_the_place_of_the_hub_is_one_sentence(hub: Hub, answer: bytes):
+    hub.commit("me/merge", **shipped_files())
+    hub.page = answer
+    with pytest.raises(UserError, match=r"http://.* does not answer as a hub does \(.*\); check HF_ENDPOINT"):
+        resolve("hub:me/merge")
+
+
+def test_a_cache_that_cannot_be_written_is_one_sentence(hub: Hub, monkeypatch: pytest.MonkeyPatch):
+    hub.commit("me/merge", **shipped_files())
+    monkeypatch.setenv("HF_HUB_CACHE", "/dev/null/cache")
+    with pytest.raises(UserError, match="hub:me/merge on http.* could not be downloaded .*check HF_HUB_CACHE"):
+        resolve("hub:me/merge")
+
+
+def test_the_card_of_an_address_is_its_own(hub: Hub):
+    push_to_hub(f"file://{resolve('merge')}", "me/merge")
+    assert hub.files("me/merge")["README.md"].endswith((resolve("merge") / "README.md").read_bytes())

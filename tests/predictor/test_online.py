@@ -537,3 +537,13 @@ def test_samples_come_from_the_generator_and_leave_the_memory_alone(forecaster: 
     assert torch.equal(draw(0), draw(0))
     assert not torch.allclose(draw(0)[:, 1:], draw(1)[:, 1:], atol=1e-4)
     assert_same(stream.forecast(), after(forecaster, *drive()), tolerance=0)
+
+
+def test_an_absent_ego_is_refused_where_positions_are_relative_to_it():
+    """Else positions would be those of the world, and a forecast would depend on the place."""
+    forecaster = OnlineForecaster(model(frame=ROAD), 1, AGENTS)
+    here = scene(states_of(0, 0, 3, 7), AGENTS - 1)
+    with pytest.raises(UserError, match="with the frame 'ego' needs the ego, agent 0, in every scene that has agents"):
+        forecaster.observe(SceneBatch.stack([here.behind_absent(1)]))
+    forecaster.observe(SceneBatch.stack([scene(states_of(0, 0, 3, 7), AGENTS)]))
+    OnlineForecaster(model(), 1, AGENTS).observe(SceneBatch.stack([here.behind_absent(1)]))

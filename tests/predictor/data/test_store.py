@@ -552,7 +552,7 @@ def test_a_stop_while_zarr_starts_its_event_loop_is_one_line(tmp_path: Path):
     [
         (
             {"edge_types": np.zeros((1, 3, 3))},
-            "edge_types of an episode must be integers for each pair",
+            "edge_types of an episode must be an array of integers for each pair",
         ),
         ({"edge_types": np.zeros((1, 2, 2), np.int8)}, r"pair of the 3 agents, got int8 \(1, 2, 2\)"),
         ({"edge_types": np.zeros((1, 5, 5), np.int8)}, r"pair of the 3 agents, got int8 \(1, 5, 5\)"),
@@ -623,3 +623,58 @@ def test_a_store_of_before_the_hash_keeps_its_own(tmp_path: Path):
     file.write_text(json.dumps(content))
     parts = [asdict(spec()), "circles", {}, 10]
     assert content_id(tmp_path / "a") == hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest() != now
+
+
+def test_numbers_of_numpy_come_back_as_numbers(tmp_path: Path):
+    scales = tuple(np.float32([20.5, 20.5, 4.0, 4.0]))
+    layout = replace(INFO.spec, dt_s=np.float32(0.5), max_agents=np.int64(8), feature_scales=scales)
+    assert type(layout.dt_s) is float and type(layout.max_agents) is int
+    noted = {"seed": np.int64(3), "share": np.float32(0.25), "done": np.bool_(True)}
+    info = StoreInfo(layout, "toy-v0", noted, causal_threshold_m=np.float32(0.5))  # type: ignore[arg-type]
+    write_store(tmp_path / "store", info, [episode(1)])
+    found = read_info_of(tmp_path / "store")
+    assert found.spec == layout and found.causal_threshold_m == 0.5
+    assert found.provenance == {"seed": 3, "share": 0.25, "done": True}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ids": np.array([2**64 - 1, 5, 6], np.uint64)}, "ids of an episode must be different, not negative, and at"),
+        ({"seed": 2**70}, "the seed of an episode must be a whole number of 64 bits, got 1180591620717411303424"),
+        ({"label": 3}, "the label of an episode must be a text, got 3"),
+        ({"edge_types": [[[0]]]}, r"edge_types of an episode must be an array of integers .*, got \[\[\[0\]\]\]"),
+    ],
+)
+@pytest.mark.unchecked
+def test_what_no_reader_takes_does_not_replace_a_store(changes: dict[str, Any], message: str, tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(7)])
+    with pytest.raises(UserError, match=message):
+        write_store(tmp_path / "store", INFO, [replace(episode(1), **changes)], overwrite=True)
+    assert_equal(read_store(tmp_path / "store").episodes[0], episode(7))
+
+
+def test_provenance_that_no_reader_takes_does_not_replace_a_store(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(7)])
+    entropy = replace(INFO, provenance={"entropy": 2**127})
+    with pytest.raises(UserError, match=r"store.*: integers have at most 19 digits .*; nothing was written"):
+        write_store(tmp_path / "store", entropy, [episode(1)], overwrite=True)
+    assert_equal(read_store(tmp_path / "store").episodes[0], episode(7))
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "read"),
+    [
+        ("edge_types", np.uint8, np.int16),
+        ("edge_types", np.int8, np.int8),
+        ("edge_attributes", np.float16, np.float32),
+        ("causal_shift_m", np.float16, np.float32),
+        ("causal_shift_m", np.float64, np.float64),
+    ],
+)
+def test_labels_of_types_that_stores_do_not_have_are_converted(name: str, kind: type, read: type, tmp_path: Path):
+    labels = np.ones((1, 3, 3, *((1,) if name == "edge_attributes" else ())), kind)
+    write_store(tmp_path / "store", INFO, [replace(episode(1), **{name: labels})])
+    found = getattr(read_store(tmp_path / "store").episodes[0], name)
+    assert found.dtype == read and (found == 1).all()

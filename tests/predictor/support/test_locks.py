@@ -66,3 +66,14 @@ def test_ctrl_c_while_a_lock_is_taken_leaves_none(tmp_path: Path, monkeypatch: p
             raise AssertionError
     with locked_path(tmp_path / "store"):
         pass
+
+
+def test_the_last_of_several_threads_gives_a_lock_back(tmp_path: Path):
+    """Two threads of one process hold it at once; the first to leave takes nothing from the other."""
+    first, second = locked_path(tmp_path / "store"), locked_path(tmp_path / "store")
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert [path.name for path in tmp_path.iterdir()] == [".store.lock"]
+    second.__exit__(None, None, None)
+    assert list(tmp_path.iterdir()) == []

@@ -3,6 +3,8 @@
 import fcntl
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -380,3 +382,38 @@ def test_a_collection_that_exists_is_refused_before_it_begins(there: Path, monke
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(UserError, match=f"{address(there)}/store exists; choose another path or pass --overwrite"):
         collect.main()
+
+
+LEFT = """
+import multiprocessing, sys
+from predictor.checkpoint import resolve
+
+def load():
+    resolve(sys.argv[1])
+
+if __name__ == "__main__":
+    process = multiprocessing.get_context(sys.argv[2]).Process(target=load)
+    process.start()
+    process.join()
+    sys.exit(process.exitcode)
+"""
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_no_process_leaves_its_copies(tmp_path: Path, method: str):
+    save_checkpoint(tmp_path / "model", model(), CHECKPOINT)
+    (tmp_path / "script.py").write_text(LEFT)
+    (tmp_path / "tmp").mkdir()
+    subprocess.run(
+        [sys.executable, "-W", "ignore", str(tmp_path / "script.py"), f"file://{tmp_path / 'model'}", method],
+        env=os.environ | {"TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": os.pathsep.join(sys.path)}, check=True,
+    )  # fmt: skip
+    assert not list((tmp_path / "tmp").glob("dgvae-rl-*"))
+
+
+def test_the_copy_of_a_checkpoint_that_changed_is_deleted(there: Path):
+    save_checkpoint(there / "model", model(), CHECKPOINT)
+    first = resolve(there / "model")
+    save_checkpoint(there / "model", model("paper"), CheckpointInfo(model("paper").spec, model("paper").config, 3))
+    second = resolve(there / "model")
+    assert second.is_dir() and not first.parents[1].exists()
