@@ -85,9 +85,9 @@ class EvaluateConfig:
     episodes: int = 50
     """Number of episodes in each environment."""
     driver: str | None = None
-    """Driver. One ego: random, idle, varied (default), keep-lane, one action in every step (slower, action-4), or the
-    path of a policy .zip (which gets the forecasts that it was trained on). Many learners: random, idle, varied,
-    heuristic (default), mixed. Both: own:module:function (docs/wrap_your_env.md)."""
+    """Driver. One ego: random, idle, varied (default), keep-lane, planner (docs/what_if.md), one action in every step
+    (slower, action-4), or the path of a policy .zip (which gets the forecasts that it was trained on). Many learners:
+    random, idle, varied, heuristic (default), mixed. Both: own:module:function (docs/wrap_your_env.md)."""
     seed: int = 900_000
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""
