@@ -60,10 +60,8 @@ class SceneSpec:
         if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
         if self.feature_names[:4] != KINEMATIC_FEATURES and self.feature_names[:6] != KINEMATIC_FEATURES_3D:
-            raise UserError(
-                f"the first features must be {KINEMATIC_FEATURES} or {KINEMATIC_FEATURES_3D}, "
-                f"got {self.feature_names[:6]}"
-            )
+            wanted = f"{KINEMATIC_FEATURES} or {KINEMATIC_FEATURES_3D}"
+            raise UserError(f"the first features must be {wanted}, got {self.feature_names[:6]}")
         if len(self.frame) != self.position_dim or not set(self.frame) <= {"ego", "world", "centroid"}:
             axes = {2: "two", 3: "three"}[self.position_dim]
             raise UserError(f"frame must be 'ego', 'world' or 'centroid' for each of {axes} axes, got {self.frame}")
