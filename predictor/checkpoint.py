@@ -139,10 +139,9 @@ def name_of_folder(path: str | Path) -> str:
     if is_hub(path):
         return hub_name(path).repository.rpartition("/")[2]
     path = Path(path)
-    if path.parent.name == "snapshots" and path.parent.parent.name.startswith(
-        "models--"
-    ):  # a download in the cache: models--OWNER--NAME/snapshots/COMMIT
-        return path.parent.parent.name.rpartition("--")[2]
+    above = path.parent.parent.name  # of a download in the cache: models--OWNER--NAME/snapshots/COMMIT
+    if path.parent.name == "snapshots" and above.startswith("models--"):
+        return above.rpartition("--")[2]
     # not resolve(), which raises where links lead in a circle
     named = Path(os.path.realpath(path)) if path.name in ("", ".", "..", BEST_OF_RUN) else path
     return named.parent.name if named.name == BEST_OF_RUN else named.name
