@@ -242,3 +242,14 @@ def test_a_reader_of_observations_serves_the_planner(wrapped: bool, monkeypatch:
     assert driver(obs) == 1
     obs = env.step(1)[0]
     assert driver(obs) == 1
+
+
+def test_a_wrapper_that_changes_actions_is_refused():
+    env = make_env("highway-fast-v0", config={"action": {"type": "ContinuousAction"}})
+    with pytest.raises(
+        UserError, match="actions of the environment itself, which RescaleAction changes; give the plann"
+    ):
+        Planner(gym.wrappers.RescaleAction(env, np.float32(-2), np.float32(2)), ConstantVelocity(ROAD))
+    env.reset(seed=0)
+    clipped, plain = Planner(gym.wrappers.ClipAction(env), ConstantVelocity(ROAD)), Planner(env, ConstantVelocity(ROAD))
+    np.testing.assert_array_equal(clipped(), plain())
