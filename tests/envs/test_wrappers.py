@@ -11,6 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries
 from envs.observation import SCENE_KEYS
+from envs.readers.base import Reader
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import load_checkpoint
@@ -444,3 +445,27 @@ def test_bounds_that_the_scenes_below_do_not_have_are_refused(bound: dict[str, A
     with pytest.raises(UserError, match=r"do not fit the SceneObservation below .60, 6.; give them to that wrapper"):
         ForecastObservation(scenes, "constant-velocity", **bound)
     ForecastObservation(scenes, "constant-velocity", perception_m=60.0, max_agents=6)
+
+
+class InPlace(Reader):
+    """Hands over arrays into which each reading writes, as a simulator may."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(SceneSpec(dt_s=1.0, max_agents=2))
+        self._scene = Scene(np.zeros((2, 4)), np.arange(2), np.ones(2, np.bool_))
+
+    def read_all(self, env: Any) -> Scene:
+        return self.read(env)
+
+    def read(self, env: Any) -> Scene:
+        self._scene.states[:] += 1.0
+        return self._scene
+
+
+def test_an_observation_keeps_its_scene_when_the_simulator_writes_in_place():
+    env = SceneObservation(gym.make("highway-fast-v0"), reader=InPlace)
+    first, _ = env.reset(seed=0)
+    scene = env.scene
+    second, *_ = env.step(1)
+    assert (first["scene_states"] == 1).all() and (second["scene_states"] == 2).all()
+    assert (scene.states == 1).all()

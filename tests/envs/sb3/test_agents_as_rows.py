@@ -555,6 +555,12 @@ def test_random_actions_reach_both_bounds_of_whole_numbers():
     assert drawn.dtype == np.int8 and 0.4 < drawn.mean() < 0.6 and set(drawn.flat) == {0, 1}
 
 
+def test_random_actions_may_have_no_axes():
+    own = {"a": spaces.Box(-1, 1, (), np.float32)}
+    drawn = random_actions(with_spaces(dict.fromkeys(own, BOX2), own)(), {"a": 0}, np.random.default_rng(0))["a"]
+    assert own["a"].contains(drawn)
+
+
 def test_random_actions_cover_each_agents_own_space():
     own = {"a": THREE, "b": BOX3, "c": spaces.MultiBinary(2)}
     env = with_spaces(dict.fromkeys(own, BOX2), own)()

@@ -19,6 +19,7 @@ from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.testing import check_reader, examine_reader, reader_problems
+from envs.testing.ego import extreme_actions
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.semantics import DT_S, LIVES, SUBJECTS, Crowd, Swarm, SwarmReader, named, read_crowd
@@ -453,3 +454,9 @@ def test_floats_in_a_space_of_whole_numbers_are_found():
     assert reader_problems(Cut(floats=False), reader) == []
     (line,) = reader_problems(Cut(floats=True), reader)
     assert "has numbers of type float64, its space uint8, which would cut them, in step 0" in line
+
+
+def test_actions_that_differ_most_lie_in_the_space():
+    space = gym.spaces.Box(200, 250, (2,), np.uint8)
+    low, middle, high = extreme_actions(space)
+    assert all(space.contains(action) for action in (low, middle, high)) and middle.tolist() == [225, 225]
