@@ -593,7 +593,7 @@ def test_attributes_fit_their_names_and_types_of_episodes_are_kept(tmp_path: Pat
 
 @pytest.mark.unchecked
 def test_a_store_without_agents_is_not_written(tmp_path: Path):
-    nobody = Episode(np.zeros((6, 0, 4), np.float32), np.zeros((6, 0), bool), np.zeros(0, np.int64), 0)
+    nobody = Episode(np.zeros((6, 0, 4), np.float32), np.zeros((6, 0), bool), np.zeros(0, np.int64), "", 0)
     with pytest.raises(UserError, match="a store needs at least one agent, got none"):
         write_store(tmp_path / "store", INFO, [nobody])
 
