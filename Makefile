@@ -34,7 +34,7 @@ SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
 test: .venv/.tools ## run the tests but the slow ones, TEST_JOBS at a time; TEST_ARGS are pytest's
 	.venv/bin/python -m pytest -n $(TEST_JOBS) --dist worksteal $(TEST_ARGS)
 
-test-all: .venv/.tools ## run the slow tests as well: takes twice as long
+test-all: .venv/.tools ## run the slow tests as well: takes three times as long
 	$(MAKE) test TEST_ARGS="-m 'not cluster' $(TEST_ARGS)"
 
 test-cluster: .venv/.tools ## run the tests on a Ray cluster of three nodes on this machine: two minutes

@@ -106,6 +106,7 @@ false
     assert done.block.line == 9 and "exit status 1" in done.error
 
 
+@pytest.mark.slow
 def test_a_block_that_takes_too_long_is_stopped(tmp_path: Path):
     done = results(
         tmp_path, "~~~bash\nsleep 2 && touch late\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5
@@ -252,6 +253,7 @@ def test_pages_that_find_no_time_are_read_and_not_run(tmp_path: Path):
         assert said in str(found)
 
 
+@pytest.mark.slow
 def test_a_time_limit_leaves_other_pages_out_at_other_commits(tmp_path: Path):
     """The first two pages begin at once, and no other one before the limit."""
     text = "```bash\nsleep 2\n```\n"

@@ -465,6 +465,7 @@ def test_a_device_that_is_not_there_is_named(command: str, monkeypatch: pytest.M
         parse(config_of(command), args=[*REQUIRED.get(command, []), "--device", "cuda"])
 
 
+@pytest.mark.slow
 def test_a_command_runs_on_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     episodes = [circling_episode(seed) for seed in range(3)]

@@ -76,6 +76,7 @@ def test_an_export_needs_the_packages_of_its_kind_only(blocked: tuple[str, ...],
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_gymnasium_users_wrap_an_env_without_the_other_packages():
     code = """
 from envs import ForecastObservation, make_env

@@ -49,6 +49,7 @@ def test_what_is_installed_here_has_licences_and_needs():
     assert sum("licenses" in component for component in by_name.values()) > 60
 
 
+@pytest.mark.slow
 def test_equal_pins_give_an_equal_bill():
     pins = sbom.read_pins()
     assert sbom.bill_of(pins, "1") == sbom.bill_of(pins, "1")

@@ -238,6 +238,7 @@ def test_a_policy_is_not_evaluated_on_another_forecaster(
     assert not (run / "evaluation").exists()
 
 
+@pytest.mark.slow
 def test_a_policy_without_a_pin_is_evaluated_with_a_notice(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -59,6 +59,7 @@ def test_an_ego_is_played_as_in_a_plain_loop():
     arena.close()
 
 
+@pytest.mark.slow
 def test_random_and_idle_stand_beside_an_ego():
     arena = EgoArena(Task("highway-fast-v0", "none"), 1)
     random, idle = (arena.play(name, [2])[0] for name in arena.baselines)
@@ -98,6 +99,7 @@ def test_a_driver_sees_the_environments_own_observation(observe: Observe, monkey
     assert seen and all(isinstance(each, np.ndarray) and each.shape == (5, 5) for each in seen)
 
 
+@pytest.mark.slow
 def test_drawn_samples_depend_on_the_seed_of_the_episode_alone():
     """Neither on the number of environments nor on the episodes before."""
 

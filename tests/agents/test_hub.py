@@ -29,6 +29,7 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
         yield served
 
 
+@pytest.mark.slow
 def test_a_policy_is_loaded_from_a_hub_by_those_who_trust_it(hub: Hub, tmp_path: Path):
     saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW), run=True)
     push_policy_to_hub(tmp_path, "me/fast")
@@ -49,6 +50,7 @@ def test_a_policy_is_loaded_from_a_hub_by_those_who_trust_it(hub: Hub, tmp_path:
     assert film.read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.slow
 def test_a_policy_of_a_hub_is_measured_by_those_who_trust_it(
     hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

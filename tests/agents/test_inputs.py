@@ -79,6 +79,7 @@ def test_no_entry_is_constant_or_only_saturated(env_id: str):
     assert (inputs.std(0) > 1e-3).float().mean() > least_moving
 
 
+@pytest.mark.slow
 def test_the_ego_s_own_path_takes_forecasts_out_of_saturation():
     """Most cars keep pace with the ego: near it all along, far from where it is now."""
     task = Task("highway-fast-v0")

@@ -180,6 +180,7 @@ def test_where_all_learn_the_driver_need_not_be_able_to_drive():
 # --- Arena ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_results_depend_on_the_seed_alone(observe: Any):
     task = Task(TAG, observe, learners=("adversary",), driver="varied")
@@ -192,6 +193,7 @@ def test_results_depend_on_the_seed_alone(observe: Any):
     assert facts(MultiagentArena(task).play(model, [4])) == facts(arena.play(model, [4]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_copies_side_by_side_play_as_one_after_the_other(observe: Any):
     """With fewer seeds than copies in the last turn, and in an arena that has played before."""

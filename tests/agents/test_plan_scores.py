@@ -118,6 +118,7 @@ def test_scores_are_added_to_the_values_of_their_actions():
             torch.testing.assert_close(values(model, shown)[:, action], score)
 
 
+@pytest.mark.slow
 def test_the_target_of_dqn_has_scores_of_its_own_and_follows():
     model = make_dqn(target_update_interval=100_000).learn(200)
     now, target = model.policy.q_net.q_net, model.policy.q_net_target.q_net
@@ -126,6 +127,7 @@ def test_the_target_of_dqn_has_scores_of_its_own_and_follows():
     assert all(one is not other for one, other in pairs)
 
 
+@pytest.mark.slow
 def test_a_policy_of_values_is_saved_with_its_plans(tmp_path: Path):
     model = make_dqn().learn(200)
     model.save(tmp_path / "policy.zip")
@@ -182,6 +184,7 @@ def test_absent_agents_are_far_away():
     assert (alone[..., :2] > 0.99).all() and (alone[..., 2] == 2).all() and (alone[..., 3] == 1).all()
 
 
+@pytest.mark.slow
 def test_the_policy_is_saved_with_its_plans(tmp_path: Path):
     model = make_ppo().learn(256)
     model.save(tmp_path / "policy.zip")

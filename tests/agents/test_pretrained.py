@@ -46,6 +46,7 @@ def test_a_run_folder_of_that_name_comes_first(tmp_path: Path, monkeypatch: pyte
         load_policy("highway-fast")
 
 
+@pytest.mark.slow
 def test_its_film_is_no_part_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     assert write_film(WatchConfig(Path("simple-tag"), seed=1, max_steps=2)) == Path("watch-1.mp4")

@@ -63,6 +63,7 @@ class Addresses(HTMLParser):
         self.found += [value for name, value in attrs if name in ("src", "href", "poster", "xlink:href") and value]
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_run_and_loads_nothing(tmp_path: Path):
     run = a_run(tmp_path)
     pictures = (np.full((48, 64, 3), 40 + i, np.uint8) for i in range(90))
@@ -96,6 +97,7 @@ def test_large_films_are_linked_and_what_is_no_film_has_no_still(tmp_path: Path,
     assert "The worst episode of an evaluation whose results are no longer beside it." in page and "poster" not in page
 
 
+@pytest.mark.slow
 def test_a_film_is_captioned_with_the_episode_of_the_evaluation_beside_it(tmp_path: Path):
     """The run's table may be of another evaluation."""
     run = a_run(tmp_path)
@@ -148,6 +150,7 @@ def a_measurement(tmp_path: Path) -> Path:
     return tmp_path / "accuracy"
 
 
+@pytest.mark.slow
 def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
     run, measured = a_run(tmp_path), a_measurement(tmp_path)
     (measured / "merge-v1.merge.worst.png").write_bytes(PNG + b"rest")

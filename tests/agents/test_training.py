@@ -295,6 +295,7 @@ def test_presets():
     assert preset_for("highway-fast-v0", "dqn", "envpool") == DQNPreset()
 
 
+@pytest.mark.slow
 def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
     short = replace(preset_for("highway-fast-v0", "ppo"), n_steps=16, batch_size=8, n_epochs=2)  # type: ignore[call-arg]
     monkeypatch.setattr("agents.training.preset_for", lambda *arguments: short)

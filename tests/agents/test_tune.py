@@ -65,6 +65,7 @@ def test_optuna_says_nothing_of_its_own(tmp_path: Path, caplog: pytest.LogCaptur
     assert not caplog.records
 
 
+@pytest.mark.slow
 def test_the_best_trial_is_written_for_train_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     best = tune(config(tmp_path / "tuned", **HIGHWAY, steps=8))
     lines = capsys.readouterr().out.splitlines()

@@ -107,6 +107,7 @@ def test_crashes_of_an_environment_that_names_no_key_are_not_guessed():
     assert {e.crashed for e in run_episodes(venv, always_two, range(8))} == {None}
 
 
+@pytest.mark.slow
 def test_driving_is_measured_in_the_episode_that_is_played():
     """The result has the measures of a plain loop over the same episode."""
     env = make_env("highway-fast-v0")

@@ -20,6 +20,7 @@ from tests.agents.helpers import TOY, policy_for
 from tests.agents.test_policy import FAST, FEW, saved
 
 
+@pytest.mark.slow
 def test_a_film_is_written_beside_the_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -48,6 +49,7 @@ def test_what_cannot_be_drawn_is_one_sentence(
         play_in_window(WatchConfig(tmp_path / "policy.zip", window=True))
 
 
+@pytest.mark.slow
 def test_a_film_is_as_long_as_asked(tmp_path: Path):
     path, _ = saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))
     lengths = []
@@ -57,6 +59,7 @@ def test_a_film_is_as_long_as_asked(tmp_path: Path):
     assert 0 < lengths[0] < lengths[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_a_window_shows_the_pictures_of_the_film(observe: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -80,6 +83,7 @@ def made_by_hand(spec: SceneSpec) -> ConstantVelocity:
     return ConstantVelocity(spec)
 
 
+@pytest.mark.slow
 def test_a_policy_of_ones_own_forecaster_is_filmed_and_loaded(tmp_path: Path):
     """Its zip, which runs code anyway, names the forecaster; the run's config alone does not import it."""
     own = f"own:{__name__}:made_by_hand"
@@ -93,6 +97,7 @@ def test_a_policy_of_ones_own_forecaster_is_filmed_and_loaded(tmp_path: Path):
         write_film(WatchConfig(tmp_path))
 
 
+@pytest.mark.slow
 def test_ids_of_envpool_are_drawn_by_highway_env(tmp_path: Path):
     pytest.importorskip("envpool")
     path, _ = saved(tmp_path, Task("envpool/HighwayFast-v0", "none"))

@@ -43,6 +43,7 @@ def test_no_text_runs_a_benchmark_as_a_file():
     assert [f"{path.name}: {hit}" for path in texts for hit in as_file.findall(path.read_text())] == []
 
 
+@pytest.mark.slow
 def test_a_command_runs_from_the_root():
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.gpu_springs", "--help"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -37,6 +37,7 @@ def small(tmp_path: Path) -> GpuSpringsConfig:
 # --- The run ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_command_from_nothing_to_a_summary(
     small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -60,6 +61,7 @@ def test_one_command_from_nothing_to_a_summary(
     assert again == json.loads(json.dumps(summary))
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on(small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch):
     """The summary has the number of steps that the time is for."""
     sizes = replace(script.SPRINGS.budgets["smoke"], steps=3, eval_every=1, val_windows=4, test_windows=4)
@@ -91,6 +93,7 @@ def test_only_missing_splits_are_made(small: GpuSpringsConfig):
 # --- The projection ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_step_is_timed_counted_and_projected(
     small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -50,6 +50,7 @@ def test_agents_count_whose_whole_future_is_known():
     np.testing.assert_allclose(scene, np.stack([np.zeros(5), np.arange(5.0)], axis=1))
 
 
+@pytest.mark.slow
 def test_command_plays_the_deployed_wrapper(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
     arguments = "--env-ids merge-v1 --episodes 1 --num-samples 3 --agents 1 2 --out".split()
     monkeypatch.setattr("sys.argv", ["joint_futures", *arguments, str(tmp_path / "joint.json")])

@@ -26,6 +26,7 @@ def test_the_machines_rate_is_of_all_products_together():
     assert lines[-1].flop == sum(r.flop or 0 for r in lines[:4])
 
 
+@pytest.mark.slow
 def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forecast, "CASES", {"quick": (forecast.Case(2, 3, 4, 2),)})
     lines = {r.name: r for r in forecast.run(QUICK) if r.what.get("preset") == "fast"}
@@ -38,6 +39,7 @@ def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pyte
     assert lines["observe + roll-out"].unit == "agent-forecasts/s"
 
 
+@pytest.mark.slow
 def test_modes_are_measured_beside_one_forecast_and_a_model_without(monkeypatch: pytest.MonkeyPatch):
     case = forecast.Case(2, 3, 4, 1)
     monkeypatch.setattr(forecast, "CASES", {"quick": (case, case._replace(samples=6))})
@@ -56,6 +58,7 @@ def test_modes_are_measured_beside_one_forecast_and_a_model_without(monkeypatch:
     assert {(0, 1), (20, 1), (20, 6)} <= set(shown)
 
 
+@pytest.mark.slow
 def test_the_cost_of_modes_and_plans_is_promised_for_a_single_scene(monkeypatch: pytest.MonkeyPatch):
     cases = forecast.Case(1, 3, 4, 1), forecast.Case(2, 3, 4, 1)
     monkeypatch.setattr(forecast, "CASES", {"quick": cases})
@@ -80,6 +83,7 @@ def test_five_plans_are_rolled_out_at_once(monkeypatch: pytest.MonkeyPatch):
     assert shapes == {(2, 5, 4, 4, 2, 5, 1, 3, 4, 4)}
 
 
+@pytest.mark.slow
 def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPatch):
     seen: dict[int, list[int]] = {}
     block = streaming.Streamed.block
@@ -116,6 +120,7 @@ class _Worker:
         return {"seconds": 1.0, "peak_bytes": 3 * 2**20}
 
 
+@pytest.mark.slow
 def test_training_counts_windows_memory_and_the_allocator(monkeypatch: pytest.MonkeyPatch):
     case = training.Case("fast", 3, 6, 4, 2)
     monkeypatch.setattr(training, "CASES", {"quick": (case,)})
@@ -131,6 +136,7 @@ def test_training_counts_windows_memory_and_the_allocator(monkeypatch: pytest.Mo
     assert training.run(QUICK)[-1].note == "skipped: needs glibc"
 
 
+@pytest.mark.slow
 def test_data_is_read_and_cut_and_absent_simulators_are_skipped(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reading, "EPISODES", {"quick": 8})
     monkeypatch.setattr(reading, "missing", lambda *modules: f"needs {modules[0]}")

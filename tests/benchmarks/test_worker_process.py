@@ -6,6 +6,7 @@ from benchmarks import worker_process
 from benchmarks.worker_process import WorkerProcess, exact_memory, peak_rise
 
 
+@pytest.mark.slow
 def test_a_worker_measures_memory_and_reports_what_it_cannot_do():
     arguments: dict[str, Any] = {"preset": "fast", "neighbours": 0, "horizon": 2}
     with WorkerProcess(1, exact_memory()) as other:

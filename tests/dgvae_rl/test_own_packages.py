@@ -47,6 +47,7 @@ def test_without_the_package_a_users_folder_hides_ours(project: Path):
     assert run(code, project) == "hidden\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["theirs", "ours"])
 def test_both_are_there_whoever_is_imported_first(project: Path, first: str):
     theirs = "import envs, agents\nfrom envs.wrappers import Mine\nassert agents.MINE == 'theirs'\n"
@@ -67,6 +68,7 @@ except UserError as error:
     assert run(code, project) == "(11, 5, 2)\ndt_s must be positive, got -1\n"
 
 
+@pytest.mark.slow
 def test_what_the_user_does_not_have_leads_to_ours(project: Path):
     """Trained policies name the classes of their networks, `agents.features` for example."""
     code = """
@@ -124,6 +126,7 @@ if __name__ == "__main__":
     assert run(code, project) == "(1, 11, 5, 2) envs.wrappers\n"
 
 
+@pytest.mark.slow
 def test_where_nothing_hides_them_both_names_are_one_module(tmp_path: Path):
     code = f"""
 {OURS}

@@ -77,6 +77,7 @@ def test_an_arm_shows_its_part_alone(name: str, bank: EntryBank, everything: dic
             assert not few or not found[key][:, 1:].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["single", "no-edges", "what-if", "oracle", "oracle-what-if"])
 def test_a_single_forecast_is_shown_to_its_last_step(name: str, bank: EntryBank):
     """Where the observation has room for one sample, the entry has no axis of samples that could be cut."""

@@ -59,6 +59,7 @@ def assert_same_sequences(found: list[Any], expected: list[Any], tolerance: floa
         assert_same(one, other, tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [1, 4])
 @pytest.mark.parametrize("has_ego", [False, True], ids=["world", "absent ego"])
 def test_copies_together_see_what_they_see_alone(samples: int, has_ego: bool, monkeypatch: pytest.MonkeyPatch):
@@ -76,6 +77,7 @@ def test_copies_together_see_what_they_see_alone(samples: int, has_ego: bool, mo
         np.testing.assert_array_equal(one.scene.scene.states, other.scene.scene.states)
 
 
+@pytest.mark.slow
 def test_noise_goes_on_and_restarts_with_a_seed(monkeypatch: pytest.MonkeyPatch):
     """Without seeds the copies draw on from where they stand; a seeded reset repeats."""
     together, apart = ParallelVecEnv(copies(num_samples=4)), alone(monkeypatch, num_samples=4)

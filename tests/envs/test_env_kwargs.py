@@ -118,6 +118,7 @@ def test_data_of_another_environment_is_no_data_of_this_one(measured: dict[str, 
     assert np.isfinite(measured["results"][0]["reduction"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "measured_by",
     [

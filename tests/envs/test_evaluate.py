@@ -108,6 +108,7 @@ def test_edges_are_measured_averaged_and_cut(tmp_path: Path):
     assert f"… with {list(EDGES)[1]} {result.edges['edges cut'].min_ade_m:.3f} m" in report.remarks(result)
 
 
+@pytest.mark.slow
 def test_a_forecaster_without_edges_has_none_to_change():
     with pytest.raises(UserError, match="edge ablations need the edges of a dG-VAE, and constant-velocity is Constant"):
         measure(TAG, STILL, edge_ablations=True)
@@ -218,6 +219,7 @@ def test_all_agents_count_in_an_arena_but_its_obstacles_do_not(in_process: None)
     assert measure(TAG, STILL).model.agents == 2 * 5 * 4
 
 
+@pytest.mark.slow
 def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     path = tmp_path / "learned"
     info = CheckpointInfo(HIGHWAY_SPEC, SIZES, HORIZON, std_m=(1.0, 2.0, 3.0))
@@ -270,6 +272,7 @@ def test_neighbours_have_a_line_where_there_is_data(in_process: None, tmp_path: 
         assert {line.num_samples for line in found.lines} == {3}
 
 
+@pytest.mark.slow
 def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, highway_checkpoint: str):
     policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
     driven = measure(ROAD, highway_checkpoint, horizon_steps=None, driver=policy)
@@ -278,6 +281,7 @@ def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, 
     assert driven.model != measure(ROAD, highway_checkpoint, horizon_steps=None).model
 
 
+@pytest.mark.slow
 def test_a_policy_drives_the_same_episodes_whatever_is_measured(
     in_process: None, tmp_path: Path, highway_checkpoint: str
 ):

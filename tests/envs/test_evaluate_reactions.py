@@ -28,6 +28,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget()
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_figure_and_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
@@ -52,6 +53,7 @@ def test_the_command_writes_table_figure_and_numbers(
     assert f"| {ELSEWHERE[0].name} | 2 (" in (out / "reactions.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_graph_is_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     """Both measurements in one run; labels are of one sender, as quick as they can be."""
     quick = replace(IN_ARENAS, horizon_s=0.2, senders=1)
@@ -70,6 +72,7 @@ def test_the_graph_is_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "| tag | " in (out / "graph.md").read_text()
 
 
+@pytest.mark.slow
 def test_plans_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     out = tmp_path / "results"
     arguments = ["--plans", "--env-ids", "merge-v1", "--checkpoint", STILL, "--episodes", "2", "--max-steps", "9"]

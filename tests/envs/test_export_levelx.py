@@ -17,6 +17,7 @@ SEED = 5
 STEPS = 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["roundabout-v1", "intersection-v2"])
 def test_what_the_loader_reads_is_what_the_simulator_did(env_id: str, tmp_path: Path):
     """At every policy step (1 s, five steps of the store) against a second simulation that is read directly."""
@@ -49,6 +50,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_the_three_files_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     out = tmp_path / "export"
     arguments = ["--env-id", "intersection-v2", "--out", str(out), "--episodes", "2", "--max-steps", "3"]

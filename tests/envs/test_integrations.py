@@ -208,6 +208,7 @@ def check_sb3_envs(venv: VecEnv, reader: MakeReader, checkpoint: str, duration: 
         venv.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [DummyVecEnv, partial(SubprocVecEnv, start_method="spawn")], ids=["dummy", "spawn"])
 def test_sb3_takes_it_as_a_wrapper_class(kind: Callable[..., VecEnv], checkpoint: str):
     """One wrapper in each environment; the reader travels to the worker process with its arguments."""

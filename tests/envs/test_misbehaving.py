@@ -47,6 +47,7 @@ def test_collection_stops_at_an_environment_that_raises_and_goes_on_without_it(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "message"),
     [("Raise", "all 1 episodes failed, the first so: "), ("ExitReset", "none of the first 1 seeds can be played: ")],
@@ -62,6 +63,7 @@ def test_a_recording_of_which_nothing_is_left_says_why(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_evaluation_names_an_environment_that_dies(tmp_path: Path, monkeypatch: Patch, capsys: Caught):
     words = ["--env-ids", env_id("Exit"), "--checkpoint", "constant-velocity", "--horizon-steps", "2", "--seed", "3"]
     words += ["--episodes", "1", "--workers", "1", "--out", str(tmp_path / "out")]

@@ -690,6 +690,7 @@ def test_registered_envs_keep_pettingzoos_contracts(env_id: str):
     check_episodes_repeat(lambda: ForecastParallelEnv(short_env(env_id), "constant-velocity"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["simple_tag_v3", "simple_speaker_listener_v4", "pursuit_v5"])
 def test_registered_envs_run_with_a_dgvae(env_id: str, tmp_path: Path):
     path = save_tiny_for(short_env(env_id), tmp_path / env_id)

@@ -36,6 +36,7 @@ def test_an_unknown_id_is_one_clear_line(env_id: str):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_an_env_of_envpool_without_envpool_says_what_to_install():
     code = """
 import sys
@@ -167,6 +168,7 @@ assert not envs.registry.is_multiagent_id("highway-v0") and envs.registry.is_mul
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_importing_the_wrappers_registers_our_ids():
     code = "import envs.wrappers, gymnasium; gymnasium.make('highway-mixed-v0'); gymnasium.make('highway-fast-v0')"
     subprocess.run([sys.executable, "-c", code], check=True)

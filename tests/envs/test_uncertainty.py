@@ -305,6 +305,7 @@ def test_vector_environments_of_sb3_show_what_single_ones_do(checkpoint: str):
     assert_all_same(found, checkpoint)
 
 
+@pytest.mark.slow
 def test_vector_environments_of_gymnasium_show_what_single_ones_do(checkpoint: str):
     makers = [partial(short_scene_env, d) for d in DURATIONS]
     env = VectorForecast(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP), checkpoint, num_samples=3)

@@ -172,6 +172,7 @@ def test_next_step_envs_are_as_if_alone(alone_with_idle_steps: list[Played], hig
             assert_same(one_of(obs, i), played.steps[t])
 
 
+@pytest.mark.slow
 def test_disabled_envs_are_as_if_alone(alone: list[Played], highway_checkpoint: str):
     env = vector(AutoresetMode.DISABLED, highway_checkpoint)
     obs, _ = env.reset(seed=SEED)
@@ -201,6 +202,7 @@ def test_disabled_partial_reset_right_after_reset(alone: list[Played], highway_c
         assert_same(one_of(again, i), alone[i].steps[1])
 
 
+@pytest.mark.slow
 def test_the_mode_is_that_of_the_environment_whatever_others_of_its_class_have(
     alone: list[Played], highway_checkpoint: str
 ):
@@ -337,12 +339,14 @@ def assert_same_sequences(first: list[Any], second: list[Any]) -> None:
         assert_same(actual, expected, tolerance=0.0)
 
 
+@pytest.mark.slow
 def test_sb3_same_seed_same_sequences(highway_checkpoint: str):
     make = partial(VecForecast, checkpoint=highway_checkpoint, num_samples=3)
     first, second = (sb3_sequence(make(DummyVecEnv(MAKERS))) for _ in range(2))
     assert_same_sequences(first, second)
 
 
+@pytest.mark.slow
 def test_sb3_seeding_again_repeats_the_samples(highway_checkpoint: str):
     venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, num_samples=3)
     first, second = sb3_sequence(venv), sb3_sequence(venv)
@@ -367,6 +371,7 @@ def gymnasium_sequence(env: VectorForecast) -> list[Any]:
     return sequence
 
 
+@pytest.mark.slow
 def test_gymnasium_same_seed_same_sequences(highway_checkpoint: str):
     env = vector(AutoresetMode.NEXT_STEP, highway_checkpoint, num_samples=3)
     other = vector(AutoresetMode.NEXT_STEP, highway_checkpoint, num_samples=3)
@@ -426,6 +431,7 @@ def test_zero_is_named(name: str, highway_checkpoint: str):
 # --- Under other wrappers, and without Stable-Baselines3 --------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv], ids=["sync", "async"])
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
@@ -486,6 +492,7 @@ def test_seeds_may_come_in_any_sequence():
     assert_same(env.reset(seed=tuple(seeds))[0], listed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maker", ["sb3", "gymnasium"])
 def test_samples_of_an_env_are_those_of_its_environment_alone(maker: str, highway_checkpoint: str):
     """Also over the ends of episodes, where the stream forecasts an environment twice in one batch."""

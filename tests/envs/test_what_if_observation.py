@@ -90,6 +90,7 @@ def test_flat_observations_copies_and_pickles_continue():
         np.testing.assert_allclose(twin.step(3)[0], expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of the checker: boxes without bounds
 def test_gymnasium_accepts_it():
     check_env(wrapped(what_if=True), skip_render_check=True)

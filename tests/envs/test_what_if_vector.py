@@ -67,6 +67,7 @@ SB3_KINDS: dict[str, Callable[[], VecEnv]] = {
 
 
 # Python 3.12 warns of every fork of a process with threads; that it works is what is tested.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", SB3_KINDS)
 def test_sb3_envs_are_as_if_alone(kind: str, alone: list[Played], options: dict[str, Any], highway_checkpoint: str):
@@ -92,6 +93,7 @@ def test_sb3_envs_are_as_if_alone(kind: str, alone: list[Played], options: dict[
         venv.close()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv], ids=["sync", "async"])
 def test_same_step_envs_are_as_if_alone(
@@ -116,6 +118,7 @@ def test_same_step_envs_are_as_if_alone(
         env.close()
 
 
+@pytest.mark.slow
 def test_next_step_envs_are_as_if_alone(highway_checkpoint: str, options: dict[str, Any]):
     alone = [play_alone(i, highway_checkpoint, idle_steps=True, **options) for i in range(len(DURATIONS))]
     made = SyncVectorEnv(MAKERS, autoreset_mode=AutoresetMode.NEXT_STEP)
@@ -127,6 +130,7 @@ def test_next_step_envs_are_as_if_alone(highway_checkpoint: str, options: dict[s
             assert_same(one_of(obs, i), played.steps[t])
 
 
+@pytest.mark.slow
 def test_disabled_envs_are_as_if_alone(alone: list[Played], options: dict[str, Any], highway_checkpoint: str):
     """Also where some environments are reset and the others are shown again as they were."""
     made = SyncVectorEnv(MAKERS, autoreset_mode=AutoresetMode.DISABLED)
@@ -143,6 +147,7 @@ def test_disabled_envs_are_as_if_alone(alone: list[Played], options: dict[str, A
                 assert_same(one_of(obs, i), played.successors[t] if ended[i] else played.steps[t])
 
 
+@pytest.mark.slow
 def test_other_entries_are_as_without_it(highway_checkpoint: str):
     """Bit for bit, with drawn samples too: plans use up no noise."""
     plain, asked = (
@@ -160,6 +165,7 @@ def test_other_entries_are_as_without_it(highway_checkpoint: str):
         without, found = (venv.step(ACTIONS[t])[0] for venv in (plain, asked))
 
 
+@pytest.mark.slow
 def test_flat_observations_and_copies_continue(highway_checkpoint: str):
     venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, what_if=True, flatten=True)
     venv.seed(SEED)

@@ -120,6 +120,7 @@ def test_any_hyperparameter_in_a_file(tmp_path_factory: pytest.TempPathFactory, 
         assert one_line(error).isprintable()
 
 
+@pytest.mark.slow
 @BUDGET
 @given(data=st.data())
 def test_any_header_of_weights(good: dict[str, Path], data: st.DataObject):

@@ -270,6 +270,7 @@ def test_bad_files_are_refused(path: Path, damage: Callable[[Path], None], messa
 # --- Names and specs --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_everything_that_ships_is_small_and_forecasts():
     assert checkpoint.shipped()
     for name in checkpoint.shipped():

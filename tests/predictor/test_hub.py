@@ -50,6 +50,7 @@ def test_what_is_pushed_is_loaded_by_its_name(hub: Hub):
     assert name_of_folder("hub:me/merge") == name_of_folder(folder) == "merge", "its name in tables"
 
 
+@pytest.mark.slow
 def test_a_download_in_a_fresh_process_says_what_is_wrong(tmp_path: Path):
     """The library loads some of its modules only once something else was asked for."""
     nowhere = {"HF_ENDPOINT": "http://127.0.0.1:9", "HF_HUB_CACHE": str(tmp_path)}
@@ -95,6 +96,7 @@ def test_the_hub_is_asked_once_and_the_cache_serves_without_it(hub: Hub, monkeyp
         resolve("hub:me/other")
 
 
+@pytest.mark.slow
 def test_a_silent_hub_is_not_waited_for(hub: Hub):
     hub.silent.set()
     began = time.monotonic()
@@ -183,6 +185,7 @@ def test_the_latest_whole_copy_serves_without_a_network(hub: Hub, monkeypatch: p
     assert resolve("hub:me/merge") == second != first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", [b"<html>please log in</html>", b"[]"])
 def test_a_page_in_the_place_of_the_hub_is_one_sentence(hub: Hub, answer: bytes):
     hub.commit("me/merge", **shipped_files())

@@ -447,6 +447,7 @@ def springs(tmp_path: Path) -> Path:
 SHORT = ("--burn-in-steps", 4, "--horizon-steps", 3, "--num-samples", 3, "--max-windows", 20)
 
 
+@pytest.mark.slow
 def test_smoke_with_labels(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], springs: Path, tmp_path: Path
 ):
@@ -471,6 +472,7 @@ def test_smoke_with_labels(
     assert "| 2 | static |" in text and "| 3 | dynamic |" in text and "nan" not in text
 
 
+@pytest.mark.slow
 def test_titles_of_pictures_hold_names_and_no_paths(monkeypatch: pytest.MonkeyPatch, springs: Path, tmp_path: Path):
     texts: dict[str, list[str]] = {}
 
@@ -515,6 +517,7 @@ def test_smoke_without_labels_and_with_an_ego(springs: Path, tmp_path: Path):
     assert "In words" not in text and "Dimension by dimension" in text
 
 
+@pytest.mark.slow
 def test_smoke_of_driving_where_agents_come_and_go(tmp_path: Path):
     episodes = []
     for seed in range(4):
@@ -536,6 +539,7 @@ def test_smoke_of_driving_where_agents_come_and_go(tmp_path: Path):
     assert (out / "graph.png").exists()
 
 
+@pytest.mark.slow
 def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
     layout = SceneSpec(
         1.0, ("world",) * 3, feature_names=KINEMATIC_FEATURES_3D, feature_scales=(1.0,) * 6, has_ego=False, max_agents=9
@@ -552,6 +556,7 @@ def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
     assert (tmp_path / "out" / "graph.png").exists()
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_findings(monkeypatch: pytest.MonkeyPatch, springs: Path, tmp_path: Path):
     monkeypatch.setattr(interpretation, "_draw", lambda *_, **__: None)
     config = InterpretConfig(

@@ -187,6 +187,7 @@ def test_shapes_of_a_network_that_fits_nowhere_are_known_at_once():
     assert max(math.prod(shape) for shape in shapes.values()) >= 2**32
 
 
+@pytest.mark.slow
 def test_shapes_need_no_compiler():
     """torch loads its compiler, which takes seconds, for arithmetic on the meta device: none is done there."""
     code = (

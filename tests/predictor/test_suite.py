@@ -70,6 +70,7 @@ def test_least_squares_is_the_limit(data: Path, tmp_path: Path):
         assert measured["features"]["direct_r2"] > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["dgvae-rl", "dvae", "dnri", "lstm-joint"])
 def test_every_kind_of_line_is_trained_and_measured(
     data: Path, tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch
@@ -183,6 +184,7 @@ def test_types_without_labels_are_renamed_and_types_with_labels_are_not(
     assert kept["accuracy"] == 0 and list(kept["permutation"]) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_a_model_is_trained_within_49_frames_and_measured_beside_nris_figures(
     nri_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -302,6 +304,7 @@ def test_seeds_are_jobs_of_their_own_and_trained_lines_alone_have_several(data: 
     assert [j.folder for j in alone] == [jobs[2].folder]  # the same result, however it is asked for
 
 
+@pytest.mark.slow
 def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -324,6 +327,7 @@ def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
     assert windows == {(12,)}
 
 
+@pytest.mark.slow
 def test_a_single_forecast_with_noise_is_measured_after_its_model_and_of_the_same_weights(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -361,6 +365,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 # --- Tables -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reports_have_a_line_for_each_model_and_the_papers_figures(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -374,6 +379,7 @@ def test_reports_have_a_line_for_each_model_and_the_papers_figures(
     assert latex.count(r"\begin{tabular}") == 4 and latex.count(r"\\") == 4 + 3 * 2 + 1
 
 
+@pytest.mark.slow
 def test_every_line_has_k_samples_and_says_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Constant velocity gets them from a Gaussian: its single forecast is the same, its best of 20 is better."""
     in_this_process(monkeypatch)

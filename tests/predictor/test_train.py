@@ -175,6 +175,7 @@ SCHEDULES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [1, 3])
 @pytest.mark.parametrize("changes", [{}, SCHEDULES, {"model": "dnri"}], ids=["plain", "schedules", "dnri"])
 def test_restored_trainer_continues_exactly(
@@ -250,6 +251,7 @@ def test_interrupted_run_ends_like_one_that_was_not(
         assert ours[0] == expected[0] and torch.equal(ours[1], expected[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [3, 4, 7], ids=["between_validations", "before_a_validation", "before_the_last"])
 def test_a_run_that_a_signal_stops_ends_like_one_that_was_not(
     tiny: None, circles: Path, uninterrupted: Path, tmp_path: Path, step: int
@@ -301,6 +303,7 @@ def test_what_a_killed_save_left_is_deleted(tiny: None, circles: Path, tmp_path:
     assert not list(out.glob(".*"))
 
 
+@pytest.mark.slow
 def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(circles, tmp_path / "run")
     train(settings)
@@ -378,6 +381,7 @@ def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Pat
     assert load_checkpoint(out)[1].provenance["result"]["step"] == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_stopped_early_says_so_and_goes_on_with_more_patience(
     tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -398,6 +402,7 @@ def test_a_run_that_stopped_early_says_so_and_goes_on_with_more_patience(
     assert state(tmp_path / "run")["step"] == 5
 
 
+@pytest.mark.slow
 def test_a_kill_during_a_validation_loses_no_step(tiny: None, circles: Path, tmp_path: Path):
     """It takes the most memory, and begins after many steps."""
 
@@ -522,6 +527,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
     words = ["--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "run")]
     command = [sys.executable, "-m", "predictor.train", *words]
@@ -585,6 +591,7 @@ def test_a_log_file_has_a_line_for_each_validation(
     assert lines == ["2", "4", "6", "7"]
 
 
+@pytest.mark.slow
 def test_existing_run_is_not_overwritten(
     tiny: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
 ):
@@ -707,6 +714,7 @@ def test_shifts_need_twins(tiny: None, circles: Path, tmp_path: Path):
         config(circles, tmp_path / "run", shift_weight=3.0, rollout_weight=0.0)
 
 
+@pytest.mark.slow
 def test_options_without_effect_do_not_stop_a_run(tiny: None, circles: Path, tmp_path: Path):
     other = config(circles, tmp_path / "mlp", model="mlp", input_changes=False, edge_geometry=False)
     train(replace(other, steps=2))

@@ -76,6 +76,7 @@ def test_planted_leaks_are_found(planted: Callable[[int], None]):
     assert run(without_forecasts(), planted) == dict.fromkeys(LIMITS, False)
 
 
+@pytest.mark.slow
 def test_a_dictionary_that_the_collector_does_not_track_is_counted():
     held = {"all": {i: float(i) for i in range(5000)}}
     before = count_entries()
@@ -133,6 +134,7 @@ def test_a_run_too_short_to_judge_is_refused():
         SoakConfig(steps=1000)
 
 
+@pytest.mark.slow
 def test_modules_are_not_asked_what_they_hold(monkeypatch: pytest.MonkeyPatch):
     """The collector of some releases of Python hangs once `_asyncio` has been asked."""
     asked = set[type]()

@@ -103,6 +103,7 @@ def test_pairs_are_those_with_the_rivals():
     assert [(pair.ours, pair.rival) for pair in two] == [(SEEN, ZEROS), (ORACLE, ZEROS), (ORACLE, SEEN)]
 
 
+@pytest.mark.slow
 def test_references_are_told_apart():
     findings = found_in(study(), results())
     assert findings.best_constant("one") == Line("slower", None)
@@ -120,6 +121,7 @@ def test_references_are_told_apart():
     assert "heuristic" in drawn and "best constant" not in drawn and "heuristic" not in learning_curves(findings)
 
 
+@pytest.mark.slow
 def test_a_legend_has_each_arm_once_where_scenarios_have_unequal_numbers_of_runs():
     fewer = [r for r in results("two") if r.seed not in (1, 2) or r.arm == "oracle"]
     drawn = learning_curves(found_in(study(("one", "two")), results() + fewer))
@@ -154,6 +156,7 @@ def written(folder: Path, found: list[Result], **changes: Any) -> tuple[str, str
     return (folder / "report.md").read_text(), (folder / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_report_says_what_was_found(tmp_path: Path):
     text, page = written(tmp_path, results())
     assert "| forecast | 3 | 5.00 (3.76 to 6.24) | 5.00 (4.67 to 5.33) | 50 % (50 to 50) | 10.0 | 20.0 |" in text
@@ -166,6 +169,7 @@ def test_the_report_says_what_was_found(tmp_path: Path):
         assert cell.replace(">", "&gt;") in page, "both forms have the same cells"
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_else(tmp_path: Path):
     _, page = written(tmp_path, results())
     tags: list[tuple[str, dict[str, str | None]]] = []
@@ -199,6 +203,7 @@ def test_the_report_counts_the_runs_that_there_are(tmp_path: Path):
     assert "1 training seed per arm" in written(tmp_path / "one", one)[0]
 
 
+@pytest.mark.slow
 def test_what_failed_is_named(tmp_path: Path):
     write_report(tmp_path, found_in(study(), results()[:-1]), "", MADE, ["one, oracle, ppo, seed 2"])
     text = (tmp_path / "report.md").read_text()
@@ -227,6 +232,7 @@ def test_intervals_as_text():
     assert interval(Estimate(float("nan"), 0.0, 0.0)) == "–"
 
 
+@pytest.mark.slow
 def test_errors_in_the_loop_stand_beside_returns(tmp_path: Path):
     errors = ((3.0, 9.0), (1.0, 8.0))
     curve = tuple(

@@ -206,6 +206,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pyte
     assert "Without a result: corridor, none, ppo, seed 0." in report and "| none | 1 |" in report
 
 
+@pytest.mark.slow
 def test_a_cell_that_is_killed_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run = config(tmp_path, study_text(DEADLY_TOY, references="[]", seeds="1"))
     assert run_study(run) == 1

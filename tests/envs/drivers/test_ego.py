@@ -151,6 +151,7 @@ def steps_on_road(name: str) -> int:
     return TRACK_STEPS
 
 
+@pytest.mark.slow
 def test_keep_lane_follows_the_track_where_idling_leaves_it():
     assert steps_on_road("keep-lane") == TRACK_STEPS
     assert steps_on_road("idle") < TRACK_STEPS

@@ -1,6 +1,7 @@
 """The planner with true futures: an upper bound of what forecasts can bring."""
 
 import numpy as np
+import pytest
 
 from envs import make_env
 from envs.drivers.planner import planner_driver
@@ -28,6 +29,7 @@ def test_it_knows_who_will_brake():
     assert risks["planner"] < 0.9
 
 
+@pytest.mark.slow
 def test_over_a_wrapper_it_shows_the_copys_own_observations_to_the_reader():
     columns = ("presence", "x", "y", "vx", "vy")
     table = {"type": "Kinematics", "features": [*columns], "absolute": True, "normalize": False, "see_behind": True}

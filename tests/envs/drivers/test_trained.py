@@ -110,6 +110,7 @@ def test_a_policy_refuses_forecasts_of_other_options(tmp_path: Path):
         MultiagentWorld(forecast_env(num_samples=2), path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     [

@@ -53,6 +53,7 @@ def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
     env.close()
 
 
+@pytest.mark.slow
 def test_a_wrapper_that_counts_the_end_of_an_episode_lets_copies_go_on():
     """Stable-Baselines3's Monitor refuses steps after the end, and highway-env's copies are played past it."""
     venv = VecForecast(
@@ -73,6 +74,7 @@ def test_an_environment_that_cannot_be_copied_is_a_sentence(tmp_path: Path):
     venv.close()
 
 
+@pytest.mark.slow
 def test_plans_have_different_futures_of_the_others():
     """Others react: behind an ego that brakes, they brake."""
     env = ForecastObservation(make_env("highway-fast-v0"), what_if=True, arm=Arm("oracle-what-if"))
@@ -82,6 +84,7 @@ def test_plans_have_different_futures_of_the_others():
     env.close()
 
 
+@pytest.mark.slow
 def test_the_environment_is_not_touched():
     plain, watched = (make_env("intersection-v2") for _ in range(2))
     watched = ForecastObservation(watched, arm=Arm("oracle"))
@@ -95,6 +98,7 @@ def test_the_environment_is_not_touched():
     watched.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"), [("OccupancyGrid", OccupancyGridObservation), ("LidarObservation", LidarObservation)]
 )
@@ -112,6 +116,7 @@ def test_costly_observations_are_not_drawn_in_copies(name: str, kind: type, monk
     env.close()
 
 
+@pytest.mark.slow
 def test_vector_observations_are_those_of_one_environment():
     from stable_baselines3.common.vec_env import DummyVecEnv
 

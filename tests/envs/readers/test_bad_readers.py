@@ -234,6 +234,7 @@ def test_an_absent_agent_is_out_of_sight_also_of_an_ego_that_sees_everything():
     assert seen.valid.tolist() == [True, True, False, False]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**16), perception_m=st.sampled_from([2.0, 40.0, np.inf]), max_agents=st.integers(1, 8))
 def test_a_batch_perceives_what_each_ego_does_and_so_do_training_windows(
     seed: int, perception_m: float, max_agents: int

@@ -206,6 +206,7 @@ def whole_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rnn, "_MANY", float("inf"))
 
 
+@pytest.mark.slow
 @pytest.mark.unchecked  # they would add some instructions for each environment
 @pytest.mark.usefixtures("whole_arrays")
 def test_no_step_loops_over_rows_in_python():

@@ -330,6 +330,7 @@ def config(env_id: str, **changes: Any) -> CollectConfig:
     return CollectConfig(**{"env_id": env_id, "out": Path("unused"), "workers": 1, "driver": ("random",), **changes})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "roundabout-v1", "u-turn-v1", "racetrack-v1"])
 def test_labels_change_nothing_that_is_recorded(env_id: str):
     runs = [collect(config(env_id, episodes=2, max_steps=6, seed=5, labels=labels)) for labels in (False, True)]

@@ -61,6 +61,7 @@ def test_a_branch_is_the_episode_up_to_its_moment(branches: list[Episode]):
         np.testing.assert_array_equal(branch.states[step + 1, others], now[others])
 
 
+@pytest.mark.slow
 def test_a_twin_is_the_same_moment_without_the_intervention(branches: list[Episode]):
     world = open_world(ROAD, "idle")
     both = record_branches(world, 5, "idle", 9, replace(ON_ROAD, twins=True))
@@ -127,6 +128,7 @@ def test_labels_are_of_the_perturbed_agent_alone(branches: list[Episode]):
         assert not known[:, 0].any() and not known[:, agent, agent].any()
 
 
+@pytest.mark.slow
 def test_the_moments_are_spread_over_the_episode():
     world = open_world("simple_spread_v3", "idle")
     drawn = [step for seed in range(20) for step, _ in _play(world, seed, 25, 3, np.random.default_rng(seed))[1]]
@@ -162,6 +164,7 @@ def test_who_is_taken_out_stays_away(env_id: str, settings: BranchRecording):
     assert removed >= 3
 
 
+@pytest.mark.slow
 def test_who_has_just_appeared_is_not_perturbed():
     """On the intersection vehicles appear all the time: one that was never seen could not be missed."""
     world = open_world(ROAD, "idle")
@@ -221,6 +224,7 @@ def test_the_last_intervention_that_is_possible_is_kept(monkeypatch: pytest.Monk
     assert len(found) == 3 and branch.ids[moment_of(branch)[1]] == last.intervention.agent
 
 
+@pytest.mark.slow
 def test_branches_are_a_function_of_the_seed(branches: list[Episode]):
     again = record_branches(open_world(ROAD, "idle"), 5, "idle", 9, ON_ROAD)
     for one, other in zip(branches, again, strict=True):
@@ -228,6 +232,7 @@ def test_branches_are_a_function_of_the_seed(branches: list[Episode]):
         np.testing.assert_array_equal(one.causal_shift_m, other.causal_shift_m)
 
 
+@pytest.mark.slow
 def test_collected_branches_come_in_the_order_of_their_seeds(tmp_path):
     config = CollectConfig(TAG, tmp_path / "s", 2, ("idle",), seed=3, max_steps=6, workers=1, branches=2)
     assert [e.seed for e in collect(config)] == [3, 3, 4, 4]

@@ -95,6 +95,7 @@ def test_an_agent_that_is_taken_out_has_no_shift():
     assert found.plain.valid.all() and valid[:, [0, 1, 3, 4]].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "driver"), WORLDS)
 def test_the_original_continues_as_if_it_was_never_copied(env_id: str, driver: str):
     world, untouched = (open_world(env_id, driver) for _ in range(2))
@@ -106,6 +107,7 @@ def test_the_original_continues_as_if_it_was_never_copied(env_id: str, driver: s
     assert_same_scenes([world.full_scene(), *played(world, 5)], [untouched.full_scene(), *played(untouched, 5)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "driver"), WORLDS)
 def test_the_plain_branch_is_what_then_happens(env_id: str, driver: str):
     world = open_world(env_id, driver)

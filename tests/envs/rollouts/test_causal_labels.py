@@ -23,6 +23,7 @@ from tests.envs.interventions import assert_same_scenes, played, road_world
 SETTINGS = replace(ON_ROADS, horizon_s=5.0, threshold_m=0.5)
 
 
+@pytest.mark.slow
 def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
     """Three in one lane, ids 1 to 3 from the rear, and the ego (0) two lanes aside, with nobody ahead."""
     world = road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0), ego_m=(25.0, 12.0))
@@ -42,6 +43,7 @@ def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
     assert labels.shift_m.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_driver_in_the_place_of_the_ego_depends_on_who_is_ahead_whatever_the_policy_does():
     """The ego (0) drives idle behind agent 2, which follows agent 3; agent 1 drives behind it."""
     world = road_world((0.0, 4.0), (50.0, 4.0), (75.0, 4.0), ego_m=(25.0, 4.0))
@@ -63,6 +65,7 @@ def test_a_driver_in_the_place_of_the_ego_yields_at_a_crossing():
     assert np.isnan(row[0]) and (row[np.isfinite(row)] > 5.0).any()
 
 
+@pytest.mark.slow
 def test_who_is_under_an_intervention_does_not_decide_for_itself():
     """Agent 1 follows agent 2, and the ego (0) agent 1; both are braked."""
     world = road_world((25.0, 4.0), (50.0, 4.0), ego_m=(0.0, 4.0))

@@ -41,6 +41,7 @@ class ByIds(SideForecaster):
         return Forecast(torch.zeros(1, 1, len(ids), 1, 2), edges, edges[..., :1], valid)
 
 
+@pytest.mark.slow
 def test_pairs_stand_beside_their_own_probability_distance_and_leader():
     """Three in a row, ids 1 to 3 from the rear, one beside them (4), and the ego (0) which is no receiver."""
     world = road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0), (20.0, 12.0), ego_m=(-30.0, 12.0))
@@ -75,6 +76,7 @@ def test_pairs_stand_beside_their_own_probability_distance_and_leader():
     np.testing.assert_allclose(to_ego.distance_m, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_nobody_is_ahead_of_an_ego_that_leads():
     world = road_world((0.0, 12.0), (15.0, 4.0), (30.0, 4.0), ego_m=(25.0, 12.0))
     forecaster = ByIds()
@@ -120,6 +122,7 @@ def test_an_episode_has_labels_at_every_fifth_step(tmp_path: Path, monkeypatch: 
         assert np.ptp(scene.edge_prob["tag"]) > 0
 
 
+@pytest.mark.slow
 def test_an_episode_is_a_function_of_its_seed_and_goes_on_as_ever(tmp_path: Path):
     checkpoint = save_tag(tmp_path / "tag")
     first, second, other = (
@@ -132,6 +135,7 @@ def test_an_episode_is_a_function_of_its_seed_and_goes_on_as_ever(tmp_path: Path
     assert not np.array_equal(first[0].distance_m, other[0].distance_m)
 
 
+@pytest.mark.slow
 def test_labels_of_one_step_do_not_change_the_next():
     world, untouched = (road_world((0.0, 4.0), (25.0, 4.0), ego_m=(0.0, 12.0)) for _ in range(2))
     world.step(), untouched.step()

@@ -136,6 +136,7 @@ def test_a_lane_goes_on_in_the_next_segment():
     assert not is_lane_change(network, ("a", "b", 0), ("c", "d", 1))  # a segment was passed unseen
 
 
+@pytest.mark.slow
 def test_a_played_episode_has_the_measures_of_its_states():
     """A plain loop over the same episode, with what the environment reports."""
     env = make_env(HIGHWAY)

@@ -236,6 +236,7 @@ def test_constant_velocity_in_the_deployed_place_is_the_baseline(env_id: str):
 # --- Memory -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who", ["road", "tag", "tag-around-an-ego"])
 def test_a_short_memory_forecasts_from_the_last_scenes_alone(who: str, tmp_path: Path, highway_checkpoint: str):
     """With one step it is a fresh memory at each scene; with as many as the episode has, it is the deployed model."""
@@ -296,6 +297,7 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     assert straight.min_ade_m > 0.1
 
 
+@pytest.mark.slow
 def test_each_sample_of_the_neighbours_is_another_recorded_future(tmp_path: Path):
     """Sample 0 is the mean of all; with few episodes, two may have been the same."""
     made = task(TAG, checkpoint=save_tag(tmp_path / "tag", **PLURAL), driver="heuristic", samples=20)
@@ -307,6 +309,7 @@ def test_each_sample_of_the_neighbours_is_another_recorded_future(tmp_path: Path
     torch.testing.assert_close(futures[:, 0], futures[:, 1:].mean(1), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -332,6 +335,7 @@ def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one
 # --- Controls at equal K ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who", ["tag", "tag-around-an-ego"])
 @pytest.mark.parametrize("samples", [3, PLURAL["num_modes"] + 2])
 def test_controls_have_as_many_samples_as_the_model_and_start_from_its_guess(who: str, samples: int, tmp_path: Path):

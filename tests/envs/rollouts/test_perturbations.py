@@ -11,6 +11,7 @@ from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played
 
 
+@pytest.mark.slow
 def test_a_share_of_the_steps_is_perturbed_and_every_kind_comes():
     world = open_world("simple_spread_v3", "idle")
     busy, kinds = [], Counter[str]()
@@ -41,6 +42,7 @@ def test_always_and_only_one_kind():
         world.step()
 
 
+@pytest.mark.slow
 def test_none_repeats_what_has_just_ended():
     """The marks of a recording could not tell the two apart, and windows would hold a beginning in their future."""
     world, begun = open_world("simple_push_v3", "idle"), 0

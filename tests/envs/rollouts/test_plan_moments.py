@@ -72,6 +72,7 @@ def test_errors_are_those_of_the_others_where_nobody_collides():
     np.testing.assert_array_equal(found.without_m[STRAIGHT], found.with_m[STRAIGHT])  # it does not react
 
 
+@pytest.mark.slow
 def test_the_world_is_not_touched_and_another_driver_holds_in_the_copy_alone():
     first, second = open_world("highway-fast-v0", "varied"), open_world("highway-fast-v0", "varied")
     assert isinstance(first, EgoWorld)
@@ -100,6 +101,7 @@ def test_the_true_plan_is_what_the_ego_does_in_the_plain_branch(monkeypatch: pyt
     np.testing.assert_array_equal(plans[0], [scene.states[0] for scene in played(world, HORIZON)])
 
 
+@pytest.mark.slow
 def test_moments_come_at_every_fifth_step_from_a_random_one_on():
     task = PlanTask("highway-fast-v0", "idle", ("constant-velocity",), 7, 16, 2)
     moments = play_plans(task)

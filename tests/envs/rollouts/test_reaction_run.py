@@ -110,6 +110,7 @@ def same(first: EnvReactions, second: EnvReactions) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reactions, "SHARE", 0.5)
     checkpoint = save_tag(tmp_path / "tag")

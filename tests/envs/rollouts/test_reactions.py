@@ -129,6 +129,7 @@ def measured(moments: int, cell: Cell, make: Callable[[World], dict[str, Any]]) 
     }
 
 
+@pytest.mark.slow
 def test_an_oracle_has_slope_one_and_half_an_oracle_half(branches: list[tuple[Branch, Any]]):
     found = measured(
         3,
@@ -290,6 +291,7 @@ def assert_equal(found: list[Perturbation], expected: list[Perturbation]) -> Non
             np.testing.assert_array_equal(shift_m, other.predicted_m[name])
 
 
+@pytest.mark.slow
 def test_an_episode_is_a_function_of_its_seed_and_cells_are_independent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

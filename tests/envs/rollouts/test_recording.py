@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from envs.rollouts.causal_labels import IN_ARENAS
 from envs.rollouts.recording import Recording, record
@@ -35,6 +36,7 @@ def test_an_agent_that_is_taken_out_is_absent_where_the_mark_says_so():
     assert done.valid[1:][~taken].all()
 
 
+@pytest.mark.slow
 def test_labels_come_every_so_many_steps_from_a_random_one_on():
     world = open_world(TAG, "idle")
     firsts = set()

@@ -158,6 +158,7 @@ def test_a_case_shows_history_forecasts_and_what_happened():
     plt.close(figure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cases", [0, 1, 6])
 def test_pictures_are_files_named_by_env_and_checkpoint(cases: int, tmp_path: Path):
     found = replace(full(), env_id="envpool/HighwayFast-v0")

@@ -79,6 +79,7 @@ def test_a_pause_of_the_whole_command_is_not_the_episode_s(monkeypatch: pytest.M
     theirs.close()
 
 
+@pytest.mark.slow
 def test_an_episode_that_fails_stops_the_others():
     """What came before it has been handed over."""
     found = []
@@ -107,6 +108,7 @@ def fail(task: Plain) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "kind", "message"),
     [

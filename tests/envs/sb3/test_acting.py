@@ -127,6 +127,7 @@ def driven(path: str, task: Task) -> Callable[[int], tuple[list[dict[str, Any]],
     return play
 
 
+@pytest.mark.slow
 def test_every_agent_remembers_its_own_episode(spread: tuple[Task, RecurrentPPO], tmp_path: Path):
     """Arena and driver agree over two episodes; alone, the second one is as after the first."""
     task, model = spread

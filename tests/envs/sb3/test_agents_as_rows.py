@@ -751,6 +751,7 @@ class Named(ParallelEnv):
         return {a: np.eye(self._spaces[a].shape[0], dtype=np.float32)[self.named[a]] for a in self.agents}
 
 
+@pytest.mark.slow
 def test_ppo_learns_what_each_role_must_do():
     venv = AgentMonitor(ParallelVecEnv([Named] * 4))
     kwargs = {"policy_kwargs": {"net_arch": [32]}, "device": "cpu", "seed": 0}

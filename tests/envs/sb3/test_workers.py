@@ -53,6 +53,7 @@ def test_an_environment_that_misbehaves_is_named_and_the_others_end(kind: str, c
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_an_environment_that_cannot_be_made_is_named():
     with pytest.raises(EnvironmentFailedError, match=r"^toy-v0, before its first reset: NameNotFound: "):
         WorkerVecEnv([Make("Unknown")], "toy-v0")

@@ -29,6 +29,7 @@ def watched(env: gym.Env, seed: int, steps: int) -> list[list[tuple[float, ...]]
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "base_id"), BASE_ID.items())
 def test_each_id_has_the_traffic_of_its_base_and_other_rewards(env_id: str, base_id: str):
     env, base = make(env_id), make(base_id)
@@ -79,6 +80,7 @@ def test_who_arrives_earns_one_and_the_episode_ends(monkeypatch: pytest.MonkeyPa
     assert (reward, terminated, truncated) == (1.0, True, False)
 
 
+@pytest.mark.slow
 def test_a_driver_that_waits_has_twenty_seconds():
     env, steps, over = make(CROSSING), 0, False
     env.reset(seed=0)

@@ -53,6 +53,7 @@ def run(env: Any, seed: int = 0) -> list[Any]:
 # --- HighwayParallelEnv -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [INTERSECTION, "intersection-multi-agent-v1"])
 def test_simulation_is_highway_envs(env_id: str):
     """Until an agent is gone, the numbers are those of the gymnasium environment."""
@@ -357,6 +358,7 @@ def displacement_m(forecasts: list[np.ndarray], scenes: list[Scene]) -> float:
     return float(np.mean(errors))
 
 
+@pytest.mark.slow
 def test_the_checkpoint_of_the_single_ego_serves_and_beats_constant_velocity():
     env = ForecastParallelEnv(HighwayParallelEnv(controlled_vehicles=3), "intersection")
     model, straight = [], []
@@ -383,16 +385,19 @@ def test_the_checkpoint_of_the_single_ego_serves_and_beats_constant_velocity():
     assert np.mean(model) < 0.9 * np.mean(straight)
 
 
+@pytest.mark.slow
 def test_pettingzoos_contracts():
     parallel_api_test(HighwayParallelEnv(duration=4), num_cycles=8)
     parallel_seed_test(HighwayParallelEnv, num_cycles=3)
 
 
+@pytest.mark.slow
 def test_pettingzoos_contracts_with_forecasts():
     parallel_api_test(ForecastParallelEnv(HighwayParallelEnv(duration=4), "intersection"), num_cycles=8)
     parallel_seed_test(lambda: ForecastParallelEnv(HighwayParallelEnv(), "intersection"), num_cycles=3)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_forecasts():
     def make() -> ForecastParallelEnv:
         env = HighwayParallelEnv(controlled_vehicles=3, duration=4)

@@ -104,6 +104,7 @@ def test_registering_again_changes_nothing():
     assert all(gym.registry[env_id] is spec for env_id, spec in before.items())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*value is -?infinity:UserWarning")  # highway-env's own observations
 @pytest.mark.filterwarnings("ignore:Your observation  has an unconventional shape:UserWarning")
 @pytest.mark.parametrize("env_id", [*BASE_ID, *COSTLY])
@@ -118,6 +119,7 @@ def test_contracts_of_gymnasium_and_sb3(env_id: str):
     picture.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", BASE_ID)
 def test_a_seed_fixes_drivers_and_motion(env_id: str):
     first, again, other = (watch(make(env_id), seed) for seed in (3, 3, 4))
@@ -128,6 +130,7 @@ def test_a_seed_fixes_drivers_and_motion(env_id: str):
     assert watch(env, 3) == first  # not the first episode of this env
 
 
+@pytest.mark.slow
 def test_environments_of_one_process_do_not_disturb_each_other():
     alone = watch(make(), 1)
     others = [make(env_id) for env_id in ("intersection-mixed-v0", "intersection-v2", HIGHWAY)]

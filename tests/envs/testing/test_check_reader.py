@@ -247,6 +247,7 @@ def test_nothing_is_found_in_the_readers_of_this_project(name: str):
     assert reader_problems(subject.make(), reader, episodes=2, max_steps=20) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["roundabout-v1", "merge-v1", "racetrack-v1", "parking-v0"])
 def test_nothing_is_found_on_other_roads(env_id: str):
     """Those on which drivers brake, turn and steer; a parking lot, on which the ego drives backwards, too."""

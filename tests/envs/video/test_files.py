@@ -49,6 +49,7 @@ def test_pictures_of_another_size_are_refused(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves its pipe open
 @pytest.mark.parametrize("script", [None, "exit 1", "head -c 1000 > /dev/null; exit 1"], ids=["gone", "silent", "dies"])
 def test_an_ffmpeg_that_fails_is_named(script: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -51,6 +51,7 @@ def decode(path: Path, height: int, width: int) -> np.ndarray:
     return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
 
 
+@pytest.mark.slow
 def test_video_has_every_simulated_picture(recording: Recording, tmp_path: Path):
     assert recording.num_steps == STEPS
     assert len(recording) == 1 + STEPS * recording.frames_per_step == 1 + STEPS * 5

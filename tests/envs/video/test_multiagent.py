@@ -183,6 +183,7 @@ def color_at(recording: MultiagentRecording, index: int, place_m: np.ndarray) ->
     return tuple(in_arena(recording, index)[int(y), int(x)].tolist())
 
 
+@pytest.mark.slow
 def test_video_has_every_picture_and_its_size_is_even(recording: MultiagentRecording, tmp_path: Path):
     assert recording.num_steps == STEPS
     assert len(recording) == 1 + STEPS * recording.frames_per_step

@@ -139,6 +139,7 @@ def test_a_road_without_others_is_drawn():
     assert draw_observation(observation).size == (1100, 700)
 
 
+@pytest.mark.slow
 def test_of_a_wrapper_dict_or_flat():
     env, flat = (ForecastObservation(make_env("highway-fast-v0"), "highway", flatten=f) for f in (False, True))
     observation, row = env.reset(seed=1)[0], flat.reset(seed=1)[0]

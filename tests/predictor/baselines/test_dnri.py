@@ -251,6 +251,7 @@ def test_values_out_of_range():
         DNRIConfig(temperature=0.0)
 
 
+@pytest.mark.slow
 def test_overfits_one_batch():
     forecaster, states = fresh("dnri"), random_states(0, 2, 5, 3, 4) / 4
     valid, now = torch.ones(2, 5, 3).bool(), torch.full((2,), 2)

@@ -140,6 +140,7 @@ def test_every_layer_is_trained():
     assert gradients(fresh("imma-dynamic")) == [True, True, True]
 
 
+@pytest.mark.slow
 def test_overfits_one_batch():
     forecaster, states = fresh("imma"), random_states(0, 2, 5, 3, 4) / 4
     valid, now = torch.ones(2, 5, 3).bool(), torch.full((2,), 2)

@@ -184,6 +184,7 @@ def test_number_of_agents_is_not_negative():
         LSTMConfig(joint=True, num_agents=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lstm", "lstm-joint"])
 def test_overfits_one_batch(kind: str):
     forecaster, states = fresh(kind), random_states(0, 2, 5, 2, 4) / 4

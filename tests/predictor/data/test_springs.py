@@ -193,6 +193,7 @@ def test_force_of_charges_falls_with_the_square_of_the_distance(product: float):
     assert apart_after(product)[0] - 2.0 == pytest.approx(way, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_charges_do_not_explode_when_they_meet():
     physics = Physics("charged", num_agents=2, box_m=5.0, frames=40, substeps=50)
     start = (positions((-0.5, 0.0), (0.5, 1e-3)), positions((0.5, 0.0), (-0.5, 0.0)))
@@ -402,6 +403,7 @@ def test_constants_must_be_positive(tmp_path: Path):
 # --- Training on it ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_charges_train_a_model_of_three_edge_types(tmp_path: Path):
     """None, attraction, repulsion: from the simulator to a step on supervised types and attributes."""
     charged = config(tmp_path / "data", physics=replace(SHORT, kind="charged"), train=6)

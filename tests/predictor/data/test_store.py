@@ -64,6 +64,7 @@ def episodes(draw: st.DrawFn) -> Episode:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(written=st.lists(episodes(), min_size=1, max_size=4))
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list[Episode]):

@@ -198,6 +198,7 @@ def presence_of(forecaster: DGVAE, valid: Tensor) -> dict[str, Tensor]:
 PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_features"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["fast", "rich", "plural"])
 @pytest.mark.parametrize(
     "frame", [("world", "world"), ROAD, ("centroid", "centroid")], ids=["world", "road", "centroid"]
@@ -220,6 +221,7 @@ def test_padding_is_invisible(size: Any, frame: Any, valid: Tensor, seed: int, p
         torch.testing.assert_close(ours, expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["fast", "rich", "plural"])
 @settings(max_examples=12)
 @given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))

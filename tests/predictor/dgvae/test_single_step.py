@@ -342,6 +342,7 @@ def test_results_follow_the_weights(change: Callable[[DGVAE], DGVAE]):
     same(after, run(forecaster, torch.enable_grad))
 
 
+@pytest.mark.slow
 def test_results_follow_every_single_weight():
     forecaster, (states, valid) = made(CONFIGS["everything"]), scenes()
     shown = states[:, -2:], valid[:, -2:]

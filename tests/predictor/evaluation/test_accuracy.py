@@ -193,6 +193,7 @@ def test_a_row_is_json():
     assert set(content["step_errors"]) == {"by_step_m", "miss_by_step", "rmse_m", "nll", "coverage"}
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10**6), st.integers(1, 11), st.permutations(range(3)))
 def test_batches_agents_and_padding_do_not_matter(seed: int, cut: int, order: list[int]):
     whole = gaussian(seed, samples=3, windows=12)

@@ -76,6 +76,7 @@ def test_what_is_not_defined_is_not_a_number():
     assert np.isnan(spearman(score, np.ones(3), ones))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_the_best_bound_has_the_highest_f1_of_all(seed: int):

@@ -75,6 +75,7 @@ def test_probabilities_and_their_types_agree():
     assert second.brier == pytest.approx(np.mean(((probs.argmax(-1) > 0) != (truth > 0))[valid].numpy()))
 
 
+@pytest.mark.slow
 @given(sets)
 def test_against_scikit_learn(batch: tuple[Tensor, Tensor, Tensor]):
     probs, truth, valid = batch

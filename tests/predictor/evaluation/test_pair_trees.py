@@ -72,6 +72,7 @@ def scenes(rng: np.random.Generator, number: int) -> tuple[np.ndarray, np.ndarra
     return np.stack(found), (front > 0) & (other < speed)
 
 
+@pytest.mark.slow
 def test_trees_learn_an_edge_that_geometry_tells():
     rng = np.random.default_rng(0)
     geometry, exists = scenes(rng, 1200)

@@ -20,6 +20,7 @@ POINT = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_page_has_curves_of_every_validation(tmp_path: Path):
     write_circles(tmp_path / "data")
     sizes = ("hidden_dim=4", "rnn_dim=3", "head_dim=4", "message_dim=4", "decoder_dim=4", "num_modes=2")

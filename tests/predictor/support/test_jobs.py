@@ -72,6 +72,7 @@ class Sleeper(Toy):
         time.sleep(300)
 
 
+@pytest.mark.slow
 def test_each_task_ends_with_its_reason(tmp_path: Path):
     names = ("good", "wrong", "broken", "killed", "idle")
     reasons = dict(run_tasks([Toy(tmp_path / name) for name in names], workers=2))
@@ -84,6 +85,7 @@ def test_each_task_ends_with_its_reason(tmp_path: Path):
     ]
 
 
+@pytest.mark.slow
 def test_tasks_wait_for_those_that_they_need(tmp_path: Path):
     tasks = [Toy(tmp_path / "last", ("first", "second")), Toy(tmp_path / "first"), Toy(tmp_path / "second", ("first",))]
     started: list[int] = []
@@ -92,12 +94,14 @@ def test_tasks_wait_for_those_that_they_need(tmp_path: Path):
     assert all(task.result.read_text() == "[]" for task in tasks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["first", "again"])
 def test_ctrl_c_while_a_process_starts_ends_it(tmp_path: Path, when: str):
     """The server imports for seconds first; a Ctrl-C in that time was lost, or left the process behind."""
     assert stopped(tmp_path, when, "began", signal.SIGINT, after_s=1.0) == 130
 
 
+@pytest.mark.slow
 def test_the_log_of_a_task_that_was_stopped_says_that_it_goes_on(tmp_path: Path):
     assert stopped(tmp_path, "late", "runs", signal.SIGTERM) == 143
     assert (tmp_path / "task" / LOG_FILE).read_text() == "stopped: the same command goes on\n"
@@ -120,6 +124,7 @@ def stopped(folder: Path, when: str, begun: str, number: signal.Signals, after_s
     return running.returncode
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_kills_what_does_not_end(tmp_path: Path):
     process = multiprocessing.get_context("spawn").Process(target=stay, args=(tmp_path / "stays",))
     process.start()

@@ -307,6 +307,7 @@ def test_errors_of_a_checkpoint_name_its_address(there: Path):
 # --- Commands ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_training_reads_stores_and_starts_from_checkpoints_there(
     there: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -399,6 +400,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_no_process_leaves_its_copies(tmp_path: Path, method: str):
     save_checkpoint(tmp_path / "model", model(), CHECKPOINT)

@@ -110,6 +110,7 @@ def step(kind: str, rollout_steps: int = 3, labels: bool = True) -> None:
     assert all(p.grad is not None for p in model.parameters()) or not rollout_steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rollout_steps", "labels"), [(0, True), (3, True), (3, False)])
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_training_step_never_looks_at_a_result(kind: str, rollout_steps: int, labels: bool):

@@ -192,6 +192,7 @@ def test_recorded_training_is_plain_training(circles: Path, tmp_path: Path, chan
     assert (recorder.forgotten, len(recorded._recorded)) == ((2, 1) if changes else (0, 1))
 
 
+@pytest.mark.slow
 def test_restored_run_records_anew(circles: Path, tmp_path: Path):
     """Recordings know tensors by address, and restoring replaces the optimiser's."""
     settings = config(circles, tmp_path, **SCHEDULES)
@@ -261,6 +262,7 @@ def test_losses_that_are_not_finite_are_found_when_the_numbers_are_read(
     assert str(error.value) == message
 
 
+@pytest.mark.slow
 def test_numbers_are_read_now_and_then(circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """And always before a checkpoint is written, so that none is of a run that has diverged."""
     settings = config(circles, tmp_path / "run", steps=13, eval_every=5)
@@ -280,6 +282,7 @@ def test_numbers_are_read_now_and_then(circles: Path, tmp_path: Path, monkeypatc
     assert looked == [4, 5, 8, 10, 12, 13]
 
 
+@pytest.mark.slow
 def test_run_that_is_read_rarely_ends_like_any_other(circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     train(config(circles, tmp_path / "often", **SCHEDULES))
     original = Trainer.__init__

@@ -53,6 +53,7 @@ def interrupted(settings: TrainConfig, step: int) -> None:
         train(settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"data_device": "device"}, {"capture": "off"}, {"threads": 1}])
 def test_a_run_may_go_on_elsewhere(circles: Path, tmp_path: Path, change: dict[str, Any]):
     """And ends with the same weights, where shapes are the same."""

@@ -165,12 +165,14 @@ def test_several_processes_take_the_steps_of_one(crowds: Path, tmp_path: Path, k
             assert apart(ours, one) < CLOSE, count
 
 
+@pytest.mark.slow
 def test_windows_on_the_device_are_shared_too(crowds: Path, tmp_path: Path):
     settings = config(crowds, tmp_path / "run", data_device="device")
     one = steps_of(Trainer(settings, load_data(settings)))
     assert all(apart(ours, one) < CLOSE for ours in together(settings, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", [CountsItself, Averages, KeepsItsGradients])
 def test_a_wrong_sum_is_seen(crowds: Path, tmp_path: Path, mistake: type[InThread]):
     settings = config(crowds, tmp_path / "run")
@@ -178,6 +180,7 @@ def test_a_wrong_sum_is_seen(crowds: Path, tmp_path: Path, mistake: type[InThrea
     assert apart(together(settings, 2, mistake)[0], one) > 10 * CLOSE
 
 
+@pytest.mark.slow
 def test_noise_of_its_own_is_seen(crowds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(crowds, tmp_path / "run")
     one = steps_of(Trainer(settings, load_data(settings)))

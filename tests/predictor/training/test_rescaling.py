@@ -73,6 +73,7 @@ def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
     return TrainConfig(data=(data,), out=out, eval_every=2, **(small | changes))
 
 
+@pytest.mark.slow
 def test_training_goes_on_with_the_scales_of_its_data(tmp_path: Path):
     """A second road ten times as long: fitted scales are ten times the first one's, forecasts begin as they were."""
     for name, factor in (("short", 1.0), ("long", 10.0)):

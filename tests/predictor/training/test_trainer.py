@@ -376,6 +376,7 @@ def test_histories_are_drawn_between_the_shortest_and_the_longest(circles: Path,
     assert min(drawn.count(n) for n in (2, 3, 4)) > 5
 
 
+@pytest.mark.slow
 def test_schedules_are_functions_of_seed_and_step(circles: Path, tmp_path: Path, watched: list[Seen]):
     """A run that is resumed sees the very batches that it would have seen."""
     settings = config(
@@ -396,6 +397,7 @@ def test_schedules_are_functions_of_seed_and_step(circles: Path, tmp_path: Path,
     assert [(s.rollout_steps, s.kl_scale) for s in watched] == [(s.rollout_steps, s.kl_scale) for s in whole]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "check"),
     [
@@ -460,6 +462,7 @@ def test_training_may_start_from_a_checkpoint(circles: Path, tmp_path: Path):
         assert torch.equal(began.model.state_dict()[name], value), name
 
 
+@pytest.mark.slow
 def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
     """Of a checkpoint whose modes have one spread, too: means, probabilities and all other weights stay bit by bit."""
     first = train(config(circles, tmp_path / "first", set=("num_modes=3", "rollout_graph=frozen")))
@@ -660,6 +663,7 @@ def test_features_learn_what_is_known_of_edges_in_units_of_its_spread(tmp_path: 
     assert not plain.model.config.feature_labels and "label" not in plain.train_step()
 
 
+@pytest.mark.slow
 def test_a_run_with_labels_goes_on_where_it_stopped(tmp_path: Path):
     data = write_followers(tmp_path / "followers")
     first = str(train(config(data, tmp_path / "first", causal_edges=True)))
@@ -674,6 +678,7 @@ def test_a_run_with_labels_goes_on_where_it_stopped(tmp_path: Path):
     assert kept.static_dim == 1 and kept.feature_labels == ("desired_speed_mps", "", "leader", "")
 
 
+@pytest.mark.slow
 def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
     first = train(config(circles, tmp_path / "first", steps=30, lr=1e-2))
     harmed = train(config(circles, tmp_path / "second", init=str(first), lr=200.0))
