@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_use, cannot_write, short
-from predictor.support.remote import is_remote, require_local, uploaded
+from predictor.support.remote import address, is_remote, require_local, uploaded
 
 _FULL_BYTES = 65_536
 """Free space below which a disk counts as full when a library fails to write without saying why."""
@@ -78,7 +78,7 @@ def told_of(path: Path, partial: Path) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        raise UserError(f"{str(error).replace(str(partial), str(path))}; nothing was written") from error
+        raise UserError(f"{str(error).replace(str(partial), address(path))}; nothing was written") from error
 
 
 @contextmanager

@@ -168,8 +168,10 @@ def _note_commit(snapshot: Path, revision: str) -> None:
     The package notes it before the first file arrives; a download that breaks off then hides the older copy.
     """
     note = snapshot.parent.parent / "refs" / revision
-    if revision != snapshot.name:
-        write_text(note, snapshot.name)
+    leads_out = ".." in note.parts or not note.is_relative_to(snapshot.parent.parent)
+    if leads_out or revision == snapshot.name or (note.is_file() and note.read_text() == snapshot.name):
+        return  # a cache that is shared may be read-only
+    write_text(note, snapshot.name)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import torch
 from predictor import checkpoint, from_hub, load_checkpoint, push_to_hub
 from predictor.checkpoint import load_forecaster, name_of_folder, resolve
 from predictor.support.errors import UserError
+from predictor.support.hub import _note_commit
 from tests.hub_stand_in import Hub, hub_for_test
 
 pytest.importorskip("huggingface_hub")
@@ -204,3 +205,21 @@ def test_a_cache_that_cannot_be_written_is_one_sentence(hub: Hub, monkeypatch: p
 def test_the_card_of_an_address_is_its_own(hub: Hub):
     push_to_hub(f"file://{resolve('merge')}", "me/merge")
     assert hub.files("me/merge")["README.md"].endswith((resolve("merge") / "README.md").read_bytes())
+
+
+def test_a_cache_that_may_only_be_read_serves_what_it_has(hub: Hub, monkeypatch: pytest.MonkeyPatch):
+    hub.commit("me/merge", **shipped_files())
+    folder = resolve("hub:me/merge")
+    checkpoint._fetched.cache_clear()
+    monkeypatch.setattr("predictor.support.hub.write_text", lambda *_: pytest.fail("nothing is to be written"))
+    assert resolve("hub:me/merge") == folder
+
+
+def test_a_revision_leads_to_no_place_outside_of_the_cache(tmp_path: Path):
+    snapshot = tmp_path / "models--me--merge" / "snapshots" / "5f6d877b"
+    snapshot.mkdir(parents=True)
+    for revision in ("../../outside", "../outside", "/" + str(tmp_path / "outside")):
+        _note_commit(snapshot, revision)
+    assert [path.name for path in tmp_path.rglob("*")] == ["models--me--merge", "snapshots", "5f6d877b"]
+    _note_commit(snapshot, "feature/one")
+    assert (tmp_path / "models--me--merge" / "refs" / "feature" / "one").read_text() == "5f6d877b"
