@@ -112,10 +112,27 @@ def new_model(
 def even_batches(rollout: int, most: int) -> int:
     """Returns the largest batch of at most `most` samples that divides a rollout into equal ones.
 
-    Where that is less than half of `most`, or 1, the last batch is a smaller one instead.
+    Where that is less than half of `most`, or 1, the last batch is a smaller one instead, of two samples or more where
+    that can be: one has no spread, by which recurrent PPO divides its advantages.
     """
     even = next(rollout // count for count in range(-(-rollout // most), rollout + 1) if rollout % count == 0)
-    return even if even > 1 and 2 * even >= most else min(rollout, most)
+    if even > 1 and 2 * even >= most:
+        return even
+    return next((size for size in range(min(rollout, most), 1, -1) if rollout % size != 1), min(rollout, most))
+
+
+def check_learns(preset: Preset, algorithm: Algorithm, steps: int) -> None:
+    """Checks that an algorithm makes an update within so many environment steps.
+
+    Raises:
+        UserError: it does not.
+    """
+    first = getattr(preset, "learning_starts", 0)
+    if first >= steps:
+        raise UserError(
+            f"{algorithm} makes its first update after learning_starts={first:,} steps, so {steps:,} steps teach it "
+            "nothing; take more steps, or lower it (--set learning_starts=…)"
+        )
 
 
 class DivergedError(UserError):

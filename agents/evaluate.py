@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.arena import EgoArena, open_arena
 from agents.episode_file import NO_PYARROW, has_pyarrow
 from agents.hub import local_policy
-from agents.policy import require_forecaster_of, task_of_policy
+from agents.policy import require_env_of, require_forecaster_of, task_of_policy
 from agents.results import MOST_EPISODES, Evaluation
 from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shipped_policies
 from agents.summaries import EXTREMES
@@ -299,6 +299,7 @@ def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
     if (zipped.parent / CONFIG_FILE).is_file():  # of which nothing is imported that the command does not name
         run = read_config(zipped.parent, "observe", "algorithm")
         algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
+        require_env_of(zipped, task)
     else:
         algorithm, task = algorithm_of(zipped), task_of_policy(zipped, config.device)
     named = {None, task.checkpoint}

@@ -24,7 +24,7 @@ from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, read_policy_note
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 
 class TrainedPolicy:
@@ -187,11 +187,28 @@ def task_of_policy(path: str | Path, device: str = "cpu", sized: bool = True) ->
     if (zipped.parent / CONFIG_FILE).is_file():
         pin = None if note is None else note.forecaster
         named = (None if note is None else note.env_id, None if pin is None else pin.checkpoint)
-        return task_of(read_config(zipped.parent), device, *named)
+        task = task_of(read_config(zipped.parent), device, *named)
+        require_env_of(zipped, task)
+        return task
     if note is None or not note.env_id:
         policy_file.algorithm_of(zipped)  # has the message for what is no policy at all
         raise UserError(f"{zipped} does not say which environment it drives; pass env=, or the run folder it is from")
     return _task_of_note(note, device, sized)
+
+
+def require_env_of(zipped: Path, task: Task) -> None:
+    """Checks that a policy was trained in the environment of the config beside it, as its note says.
+
+    Raises:
+        UserError: it was not.
+    """
+    note = read_policy_note(zipped)
+    trained = "" if note is None else note.env_id
+    if trained and trained != task.env_id:
+        raise UserError(
+            f"{zipped} was trained on {short(trained, 80)}, but {CONFIG_FILE} beside it is that of a run on "
+            f"{task.env_id}; move the policy into a folder of its own"
+        )
 
 
 def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:

@@ -14,6 +14,7 @@ import numpy as np
 from envs.arms import ARMS, Arm, EntryBank, EntryLayout
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.entry_bank import record_bank
+from envs.own_observation import check_unwrapped
 from envs.parallel import ForecastParallelEnv
 from envs.registry import (
     arguments_of,
@@ -270,11 +271,14 @@ class Task:
             return self._check_multiagent()
         env = self.make()
         env.close()
+        check_unwrapped(env.observation_space, f"env '{self.env_id}'")
         _ = self.scene_spec
         return env.action_space
 
     def _check_multiagent(self) -> gym.Space:
         env = self.make()
+        for agent in env.possible_agents:
+            check_unwrapped(env.observation_space(agent), f"'{agent}' of {self.env_id}")
         if self.observe != "none":
             env = self.wrapped(env)
         learners = learners_named(env.possible_agents, self.learners, self.env_id)

@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.algorithms import check_actions, check_finite, log_interval, new_model
+from agents.algorithms import check_actions, check_finite, check_learns, log_interval, new_model
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig
 from agents.forecast_errors import ForecastErrors
@@ -86,7 +86,7 @@ class TrainingPlan:
             raise UserError(f"seed must lie in [0, {SELECTION_SEED}), got {self.seed}")
         object.__setattr__(self, "device", resolve_device(self.device))
         require_algorithm(self.algorithm)
-        _ = self.preset  # checks the settings
+        check_learns(self.preset, self.algorithm, self.steps)
 
     @property
     def preset(self) -> Preset:
@@ -149,7 +149,7 @@ def _learn(
     plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote, progress_bar: bool
 ) -> None:
     """Trains for the remaining steps."""
-    every = max(plan.steps // plan.selections, 1)
+    every = plan.steps / plan.selections
     checkpoint = run_dir / CHECKPOINT_FILE
     kept = read_note(checkpoint)
     errors, progress = ForecastErrors(kept.get("loop_errors")), StepProgress(plan.steps, plan.num_envs)
@@ -294,7 +294,7 @@ class SelectBest(BaseCallback):
         arena: Arena,
         path: Path,
         num_episodes: int,
-        every_steps: int,
+        every_steps: float,
         note: PolicyNote | None = None,
         *,
         curve: Path | None = None,

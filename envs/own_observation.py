@@ -71,6 +71,18 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
     return dict(space.spaces)
 
 
+def check_unwrapped(space: gym.Space, source: str) -> None:
+    """Checks the own observation space of an environment that no wrapper of ours is put around (`own_spaces`).
+
+    One that has forecasts or scenes already, from a wrapper inside, passes, as does what is no Dict.
+
+    Raises:
+        UserError: it has an entry with the name of an added one, or is composed otherwise than as a flat Dict.
+    """
+    if isinstance(space, gym.spaces.Dict) and not carries_forecasts(space) and not set(SCENE_KEYS) <= set(space):
+        own_spaces(space, source)
+
+
 def own_entries(observation: Any) -> dict[str, Any]:
     """Returns an environment's own observation as entries, in a new dict."""
     return dict(observation) if isinstance(observation, Mapping) else {OWN_KEY: observation}
@@ -153,7 +165,7 @@ def own_part(space: gym.spaces.Dict) -> dict[str, gym.Space]:
 
 def without_added(observation: Any) -> Any:
     """Returns an environment's own observation, out of one with added entries; others as they are."""
-    if not isinstance(observation, Mapping):
+    if not isinstance(observation, Mapping) or not ADDED_KEYS & observation.keys():
         return observation
     own = {key: value for key, value in observation.items() if key not in ADDED_KEYS}
     return own[OWN_KEY] if own.keys() == {OWN_KEY} else own
@@ -161,7 +173,7 @@ def without_added(observation: Any) -> Any:
 
 def space_without_added(space: gym.Space) -> gym.Space:
     """Returns the space of `without_added`."""
-    if not isinstance(space, gym.spaces.Dict):
+    if not isinstance(space, gym.spaces.Dict) or not ADDED_KEYS & space.spaces.keys():
         return space
     own = own_part(space)
     return own[OWN_KEY] if own.keys() == {OWN_KEY} else gym.spaces.Dict(own)

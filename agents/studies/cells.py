@@ -31,7 +31,7 @@ from agents.studies.results import RESULT_FILE, Result, write_result
 from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
-from envs.drivers.content import content_of
+from envs.drivers.content import content_of, content_of_module
 from envs.drivers.planner import is_planner, planner_checkpoint, planner_config
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
@@ -107,6 +107,8 @@ class Cell:
             "test": [EVALUATION_SEED, self.episodes],
             "versions": {name: _version(name) for name in RULES},
         }
+        if (module := content_of_module(self.task.env_id)) is not None:
+            content["module"] = module
         if self.plan is None:
             return content | {"driver": self.line}
         if self.plan.algorithm in CONTRIB:
@@ -118,6 +120,8 @@ class Cell:
         unrelated = {"task", "device", "in_process", "selection_envs", "settings"}
         if not self.task.is_multiagent:
             unrelated.add("shaping")
+        if self.plan.steps % self.plan.selections:  # where they do not divide, measurements once lay elsewhere
+            content["selections"] = "in equal parts"
         values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
         return content | {"plan": values, "preset": _named(self.plan.preset)}
 

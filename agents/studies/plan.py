@@ -14,7 +14,7 @@ from agents.presets import Algorithm
 from agents.task import NO_CHECKPOINT, SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, is_planner
-from envs.registry import entry_for
+from envs.registry import entry_for, is_multiagent_id
 from envs.sb3.algorithms import algorithm_named
 from predictor.own_forecasters import is_own
 from predictor.support.config_checks import check_at_least, check_at_most, check_choices
@@ -32,6 +32,7 @@ MOST_SEEDS = 10_000
 MOST_BYTES = MIB
 """Largest size of a study file."""
 REFERENCES = (PLANNER, CONSTANT_ACTIONS, "random", "idle")
+MULTIAGENT_REFERENCES = ("random", "idle")
 RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
 _PLACES = ("scenario", "env_id")
@@ -113,8 +114,9 @@ class Study:
     checkpoint_every: int = 2_000
     """Number of environment steps between checkpoints, from which a killed training goes on. Episodes end there, so
     `checkpoint_every / num_envs` should be well above their length."""
-    references: tuple[str, ...] = REFERENCES
-    """Drivers that are measured without training, where a scenario names none of its own."""
+    references: tuple[str, ...] | None = None
+    """Drivers that are measured without training, where a scenario names none of its own; None: the planner, constant
+    actions, random and idle, of which PettingZoo's environments have the last two."""
     rivals: tuple[str, ...] | None = None
     """Arms that every other arm is compared with; None: zeros and constant-velocity, where the study has them."""
     floor: str = FLOOR
@@ -304,6 +306,8 @@ def _scenario(name: str, table: Any, study: Study, where: str) -> Scenario:
     for key in own:
         if key in table:
             own[key] = converted(table.pop(key), hints[key], f"{where}: {key}")
+    if own["references"] is None:
+        own["references"] = MULTIAGENT_REFERENCES if is_multiagent_id(str(own["env_id"])) else REFERENCES
     try:
         return Scenario(name=name, options=_task_options(table, where, tuple(own)), **own)  # type: ignore[arg-type]
     except UserError as error:

@@ -14,7 +14,16 @@ def content_of(driver: str) -> str | None:
 
     None for drivers that are named, not read from a file.
     """
-    file = _file_of(driver)
+    return _sha256(_file_of(driver))
+
+
+def content_of_module(env_id: str) -> str | None:
+    """Returns the SHA-256 of the module that registers an environment ("module:Id"); None for other ids."""
+    module, colon, _ = env_id.partition(":")
+    return _sha256(_file_of_module(module)) if colon else None
+
+
+def _sha256(file: Path | None) -> str | None:
     if file is None or not file.is_file():
         return None
     with file.open("rb") as opened:
@@ -27,6 +36,10 @@ def _file_of(driver: str) -> Path | None:
     planned = planner_checkpoint(driver) if is_planner(driver) else ""
     if is_own(driver) or is_own(planned):
         module, colon, _ = (planned or driver).removeprefix(PREFIX).partition(":")
-        found = importlib.util.find_spec(module) if colon else None
-        return None if found is None or found.origin is None else Path(found.origin)
+        return _file_of_module(module) if colon else None
     return None if planned in ("", ORACLE, CONSTANT_VELOCITY) else resolve(planned) / WEIGHTS
+
+
+def _file_of_module(module: str) -> Path | None:
+    found = importlib.util.find_spec(module)
+    return None if found is None or found.origin is None else Path(found.origin)

@@ -87,8 +87,9 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
     tries = filter(None, (possible(world, sender, steps) for sender in _candidates(world, settings)))
     tried = [intervention for of_sender in islice(tries, settings.senders) for intervention in of_sender]
     point = BranchPoint(world, steps) if tried else None
+    if point is None or not point.plain.valid[-1].any():  # the episode ends within the horizon
+        return CausalLabels(ids, shift_m)
     for intervention in tried:
-        assert point is not None
         column = ids.index(intervention.agent)
         found = direct_shift_m(point, point.perturbed(intervention), settings.threshold_m)
         shift_m[:, column] = np.fmax(shift_m[:, column], found)
@@ -146,8 +147,12 @@ def shift_in_place_of_ego_m(
 def farthest(found: Branches, threshold_m: float, steps: int | None = None) -> Float[np.ndarray, " agents"]:
     """Returns each agent's farthest shift over the first steps [m]; None takes all.
 
-    NaN for an agent that one branch does not have at each step, unless it has moved beyond the threshold before.
+    NaN for an agent that one branch does not have at each step, unless it has moved beyond the threshold before. Where
+    the episode ends within these steps all are NaN: of nobody it is known whether it would have moved so far.
     """
+    last = len(found.plain.valid) - 1 if steps is None else steps
+    if not found.plain.valid[last].any():
+        return np.full(found.plain.valid.shape[1], np.nan)
     shift, valid = (found_all[: None if steps is None else steps + 1] for found_all in found.shift())
     farthest_m = np.linalg.norm(shift, axis=-1).max(axis=0)
     return np.where(valid.all(axis=0) | (farthest_m > threshold_m), farthest_m, np.nan)

@@ -102,3 +102,15 @@ def window_sizes(windows: Windows) -> Int[np.ndarray, " windows"]:
         episode, now = (torch.from_numpy(column) for column in windows.index[begin:end].T.copy())
         sizes.append(windows.cast(episode, now, windows.history_steps).size.numpy())
     return np.concatenate(sizes)
+
+
+def with_agents(windows: Windows) -> Windows:
+    """Leaves out, in place, the windows in which no agent is seen: they teach nothing.
+
+    Raises:
+        UserError: none is left, or an ego is missing at an observed step.
+    """
+    windows.index = windows.index[window_sizes(windows) > 0]
+    if not len(windows):
+        raise UserError("no agent is there in any window of the episodes for training; check the recording")
+    return windows

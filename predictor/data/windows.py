@@ -125,6 +125,8 @@ class Windows:
     def batch(self, indices: Int[np.ndarray, " batch"], history_steps: int | None = None) -> WindowBatch:
         """Cuts and pads the given windows; agents beyond the widest window cost nothing.
 
+        Windows without an agent have an absent one, since networks compute nothing of none.
+
         Args:
             indices: numbers of the windows.
             history_steps: a shorter history than the longest one.
@@ -135,7 +137,7 @@ class Windows:
         episode, now = (torch.from_numpy(column) for column in self.index[indices].T.copy())
         history = min(history_steps or self.history_steps, int(now.max()) + 1)
         casts = self.cast(episode, now, history)
-        agents, time = int(casts.size.max()), history + self.horizon_steps
+        agents, time = max(1, int(casts.size.max())), history + self.horizon_steps
         return window_batch(cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents))
 
     def cast(self, episode: Int[Tensor, " batch"], now: Int[Tensor, " batch"], history_steps: int) -> Casts:
@@ -144,7 +146,7 @@ class Windows:
         Raises:
             UserError: the ego is missing at an observed step.
         """
-        width = int(self.flat.columns[episode].max())
+        width = max(1, int(self.flat.columns[episode].max()))
         casts = cast(self.flat, episode, now, history_steps, width, self.spec.has_ego)
         if self.spec.has_ego and not casts.ego_stays.all():
             window = int((~casts.ego_stays).nonzero()[0])

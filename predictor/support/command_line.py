@@ -42,7 +42,8 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         args: words of the command line; None takes those of this process.
 
     Raises:
-        UserError: the config rejects a value, or a value does not have its field's type.
+        UserError: the config rejects a value, a value does not have its field's type, or an option that takes several
+            values is given twice.
         SystemExit: options are unknown or missing (status 2, listed on stderr), or help is asked for (status 0).
     """
     words = sys.argv[1:] if args is None else list(args)
@@ -53,6 +54,7 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         if hidden := _seldom_used(config_class):
             description = f"{(description or '').strip()}\n\n{len(hidden)} more options: {HELP_ALL}."
         config_class = _for_help(config_class, hidden)
+    _check_given_once(config_class, words)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
@@ -67,6 +69,20 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
     check_numbers(config)
     commit_at_start()
     return config
+
+
+def _check_given_once(config_class: type, words: Sequence[str]) -> None:
+    """Checks that no option with several values is given twice: the later one would silently replace the earlier one.
+
+    Raises:
+        UserError: one is.
+    """
+    hints = get_type_hints(config_class)
+    several = {field.name.replace("_", "-") for field in fields(config_class) if "tuple" in str(hints[field.name])}
+    given = [word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    for name in given:
+        if name in several and given.count(name) > 1:
+            raise UserError(f"--{name} is given {given.count(name)} times; give all its values after one: --{name} A B")
 
 
 def _seldom_used(config_class: type) -> list[str]:

@@ -32,7 +32,7 @@ def rescaled(model: nn.Module, name: str, scales: dict[str, tuple[float, ...]], 
     Args:
         model: network whose scales are replaced.
         name: name of the model.
-        scales: new scales, by field of the config.
+        scales: new scales, by field of the config; where they are empty, since the data show none, the old ones stay.
         horizon_steps: number of steps that the copy forecasts.
 
     Raises:
@@ -40,7 +40,7 @@ def rescaled(model: nn.Module, name: str, scales: dict[str, tuple[float, ...]], 
     """
     source: Any = model
     before, spec = source.config, source.spec
-    after = replace(before, **{k: v for k, v in scales.items() if k not in _OF_PARTS or getattr(before, k)})
+    after = replace(before, **{k: v for k, v in scales.items() if v and (k not in _OF_PARTS or getattr(before, k))})
     weights = {key: value.clone() for key, value in source.state_dict().items()}
     features = spec.num_features
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.causal_edges import with_causal_edges
+from predictor.data.device_windows import with_agents
 from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
@@ -133,17 +134,10 @@ def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
 
 
 def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
-    if not validation or config.val_history_steps == 1:
-        return Windows(episodes, spec, config.history_steps, config.horizon_steps)
-    # as in the tables: whole burn-in, whole horizon
-    return Windows(
-        episodes,
-        spec,
-        config.history_steps,
-        config.horizon_steps,
-        min_future_steps=config.horizon_steps,
-        min_history_steps=config.val_history_steps,
-    )
+    whole = validation and config.val_history_steps > 1  # as in the tables: whole burn-in, whole horizon
+    future, history = (config.horizon_steps, config.val_history_steps) if whole else (1, 1)
+    windows = Windows(episodes, spec, config.history_steps, config.horizon_steps, future, history)
+    return windows if validation else with_agents(windows)
 
 
 class Trainer:

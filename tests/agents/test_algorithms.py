@@ -94,7 +94,7 @@ def test_it_trains_goes_on_and_is_measured(algorithm: Algorithm, tmp_path: Path)
 def test_models_have_the_values_of_their_preset(algorithm: Algorithm):
     task = replace(task_for(algorithm), observe="none")
     venv = make_venv(task, 1)
-    model = make_model(TrainingPlan(task, algorithm, 10, 1, 0), venv)
+    model = make_model(TrainingPlan(task, algorithm, 1_000, 1, 0), venv)
     venv.close()
     assert type(model) is algorithm_class(algorithm)
     preset = preset_for(task.env_id, algorithm)
@@ -112,7 +112,7 @@ def test_sizes_of_quantiles_and_memories_reach_the_networks():
     def policy(algorithm: Algorithm, **settings: Any) -> Any:
         task = replace(task_for(algorithm), observe="none")
         venv = make_venv(task, 1)
-        model = make_model(TrainingPlan(task, algorithm, 10, 1, 0, settings=settings), venv)
+        model = make_model(TrainingPlan(task, algorithm, 1_000, 1, 0, settings=settings), venv)
         venv.close()
         return model.policy
 

@@ -245,7 +245,7 @@ def test_policies_do_not_score_plans_of_continuous_actions(monkeypatch: pytest.M
 )
 def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extractor: type):
     task = Task("highway-fast-v0", "constant-velocity", what_if=what_if)
-    plan = TrainingPlan(task, algorithm, 10, 1, 0)
+    plan = TrainingPlan(task, algorithm, 1_000, 1, 0)
     venv = make_venv(task, 1, in_process=True)
     model = make_model(plan, venv)
     policy: Any = model.policy.q_net if algorithm == "dqn" else model.policy

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from agents import evaluate
 from agents.arena import MultiagentArena
 from agents.policy import CountedEpisodes, TrainedPolicy, is_recurrent, load_policy, task_of_policy
 from agents.runs import policy_zip, save_model
@@ -54,6 +55,17 @@ def test_a_zip_brings_its_environment(observe: Any, tmp_path: Path):
     found = task_of_policy(path)
     assert (found.env_id, found.observe, found.make_kwargs) == (FAST, observe, json.loads(FEW))
     assert found.note.forecaster == task.note.forecaster
+
+
+def test_a_zip_beside_the_config_of_another_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    saved(tmp_path, Task(FAST, "none", env_kwargs=FEW), run=True)
+    other, _ = saved(tmp_path, Task("merge-v1", "none"))
+    message = "policy.zip was trained on merge-v1, but config.json beside it is that of a run on highway-fast-v0"
+    with pytest.raises(UserError, match=message):
+        load_policy(other)
+    monkeypatch.setattr("sys.argv", ["evaluate", "--run-dir", str(other), "--out", str(tmp_path / "out")])
+    with pytest.raises(UserError, match=message):
+        evaluate.main()
 
 
 @pytest.mark.filterwarnings("ignore:.* has no note")

@@ -110,6 +110,32 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
     assert read_note(tmp_path / "best.zip")["steps"] == 24
 
 
+@pytest.mark.parametrize(("steps", "selections", "expected"), [(10, 3, [4, 7, 10]), (9, 2, [5, 9]), (3, 5, [1, 2, 3])])
+def test_a_policy_is_measured_as_often_as_it_is_said(
+    steps: int, selections: int, expected: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """At most once after each update; the DQN updates after each step."""
+    measured = list[int]()
+    monkeypatch.setattr(SelectBest, "_measure", lambda self: measured.append(self.num_timesteps) or note(self))
+
+    def note(select: SelectBest) -> None:
+        select._measured_at = select.num_timesteps
+
+    settings = {"learning_starts": 0, "net_arch": (4,), "batch_size": 2}
+    train(
+        plan(algorithm="dqn", steps=steps, selections=selections, settings=settings, in_process=True), tmp_path, False
+    )
+    assert measured == expected
+
+
+def test_steps_that_teach_nothing_are_refused():
+    with pytest.raises(
+        UserError, match=r"dqn makes its first update after learning_starts=200 steps, so 200 steps teach"
+    ):
+        plan(algorithm="dqn", steps=200)
+    assert plan(algorithm="dqn", steps=201).steps == plan(algorithm="dqn", steps=201, settings={}).steps
+
+
 @pytest.mark.parametrize("every_steps", [2, 8])
 def test_each_measurement_is_of_a_model_that_has_learned_from_all_that_it_collected(every_steps: int, tmp_path: Path):
     """The last one, too, and none is of a model that was measured already."""
@@ -264,7 +290,7 @@ def test_dqn_needs_discrete_actions():
     space = gym.spaces.Box(-1, 1, (2,), np.float32)
     plan(algorithm="ppo").check_action_space(space)
     with pytest.raises(UserError, match="dqn needs a discrete action space, highway-fast-v0 has Box"):
-        plan(algorithm="dqn").check_action_space(space)
+        plan(algorithm="dqn", steps=201).check_action_space(space)
 
 
 def test_models_follow_their_preset():
@@ -273,7 +299,7 @@ def test_models_follow_their_preset():
     assert isinstance(ppo, PPO)
     assert (ppo.n_steps, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (128, 64, 0.8, 5e-4)
     assert isinstance(ppo.policy.features_extractor, ForecastAttention)
-    dqn = make_model(plan(algorithm="dqn"), venv)
+    dqn = make_model(plan(algorithm="dqn", steps=201), venv)
     assert isinstance(dqn, DQN)
     assert (dqn.buffer_size, dqn.learning_starts, dqn.target_update_interval) == (15_000, 200, 50)
     venv.close()
@@ -315,9 +341,18 @@ def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize(
     ("rollout", "most", "batch"),
-    [(4800, 480, 480), (75, 480, 75), (600, 480, 300), (1600, 480, 400), (7, 4, 4), (3, 2, 2)],
+    [
+        (4800, 480, 480),
+        (75, 480, 75),
+        (600, 480, 300),
+        (1600, 480, 400),
+        (7, 4, 4),
+        (3, 2, 2),
+        (65, 64, 63),
+        (193, 64, 63),
+    ],
 )
-def test_batches_divide_a_rollout(rollout: int, most: int, batch: int):
+def test_batches_divide_a_rollout_or_leave_more_than_one_sample(rollout: int, most: int, batch: int):
     assert even_batches(rollout, most) == batch
 
 

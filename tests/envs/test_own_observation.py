@@ -14,6 +14,7 @@ from envs.own_observation import (
     carries_forecasts,
     check_own,
     check_reward,
+    check_unwrapped,
     own_entries,
     own_spaces,
     space_without_added,
@@ -157,10 +158,28 @@ def test_every_added_entry_is_known(highway_checkpoint: str):
 
 def test_arrays_have_an_entry_of_their_own():
     array = np.zeros(3)
-    assert own_entries(array) == {"observation": array} and without_added({"observation": array}) is array
+    assert own_entries(array) == {"observation": array} and without_added({"observation": array, "valid": 1}) is array
     assert without_added(array) is array
     box = gym.spaces.Box(0, 1, (2,))
     assert space_without_added(box) is box and own_spaces(box, "") == {"observation": box}
+    assert space_without_added(gym.spaces.Dict({"observation": box, "valid": box})) is box
+
+
+def test_a_dict_to_which_nothing_was_added_stays():
+    """An environment's own observation may be a Dict with this one entry."""
+    seen, space = {"observation": np.zeros(2)}, gym.spaces.Dict({"observation": gym.spaces.Box(0, 1, (2,))})
+    assert without_added(seen) is seen and space_without_added(space) is space
+
+
+def test_names_of_added_entries_are_refused_without_forecasts_too(highway_checkpoint: str):
+    box = gym.spaces.Box(0, 1, (2,))
+    with pytest.raises(UserError, match=r"of env 'a' has an entry 'agents', as forecasts have; rename it"):
+        check_unwrapped(gym.spaces.Dict({"agents": box, "position": box}), "env 'a'")
+    for space in (box, gym.spaces.Dict({"position": box}), gym.spaces.Tuple([box])):
+        check_unwrapped(space, "env 'a'")
+    inside = gym.make("highway-fast-v0")
+    check_unwrapped(ForecastObservation(inside, highway_checkpoint).observation_space, "env 'a'")
+    check_unwrapped(SceneObservation(inside).observation_space, "env 'a'")
 
 
 BOX = gym.spaces.Box(-1, 1, (2,), np.float32)

@@ -164,3 +164,17 @@ def test_what_cannot_run_is_said_before_anything_runs(
     with pytest.raises(UserError, match=f"^corridor.toml: .*{message}") as error:
         cells(**changes)
     assert "\n" not in str(error.value)
+
+
+def test_the_code_of_an_environment_of_ones_own_is_in_the_name(
+    cells: Callable[..., list[Cell]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    before = {cell.title: cell.name for cell in cells()}
+    monkeypatch.setattr("agents.studies.cells.content_of_module", lambda env_id: f"sha of {env_id}")
+    after = {cell.title: cell.name for cell in cells()}
+    assert before.keys() == after.keys() and not {*before.values()} & {*after.values()}
+
+
+def test_only_uneven_measurements_have_another_name(cells: Callable[..., list[Cell]]):
+    assert "selections" not in next(c for c in cells(steps="512", selections="2") if c.plan).content
+    assert "selections" in next(c for c in cells(steps="512", selections="3") if c.plan).content

@@ -161,3 +161,9 @@ def test_headroom_has_floor_and_ceiling_alone(tmp_path: Path):
 
 def test_arms_are_those_of_the_task():
     assert {"none", "constant-velocity", "forecast"} <= set(get_args(Observe))
+
+
+def test_drivers_beside_the_arms_are_those_that_the_environment_has(tmp_path: Path):
+    text = study_text().replace('references = ["random", "constant-actions"]\n', "") + "[scenarios.simple_tag_v3]\n"
+    one, many = read_study(study_path(tmp_path, text)).scenarios
+    assert one.references == ("planner", "constant-actions", "random", "idle") and many.references == ("random", "idle")

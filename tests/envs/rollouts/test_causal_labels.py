@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs.rollouts.branches import Branches, copied
+from envs.rollouts.branches import Branch, Branches, BranchPoint, copied
 from envs.rollouts.causal_labels import (
+    IN_ARENAS,
     ON_ROADS,
     CausalLabels,
     causal_labels,
@@ -126,8 +127,23 @@ def test_what_leaves_is_unknown_unless_it_moved(moved_m: float, expected: float)
     valid[3, 1] = False
     found = Branches.__new__(Branches)
     object.__setattr__(found, "shift", lambda: (shift, valid))
+    object.__setattr__(found, "plain", Branch(shift, valid, (), frozenset()))
     np.testing.assert_array_equal(farthest(found, 1.0), [0.0, expected])
     np.testing.assert_array_equal(farthest(found, 1.0, steps=2), [0.0, moved_m])
+
+
+@pytest.mark.parametrize(("steps_before", "known"), [(15, True), (16, False)])
+def test_nothing_is_known_where_the_episode_ends_within_the_horizon(steps_before: int, known: bool):
+    """An episode has 25 steps, the horizon ten. Else those that moved far would be known, and the others not."""
+    world = open_world("simple_tag_v3", "heuristic")
+    world.reset(2)
+    played(world, steps_before)
+    labels = causal_labels(world, replace(IN_ARENAS, near_m=10.0))
+    assert (~np.isnan(labels.shift_m)).any() == known
+    point = BranchPoint(world, 10)
+    pushed = point.perturbed(Intervention(point.ids[0], "brake", 1, 8.0, at_once=True))
+    assert (~np.isnan(farthest(pushed, 0.0))).any() == known
+    assert (~np.isnan(farthest(pushed, 0.0, steps=9))).any()
 
 
 @pytest.mark.parametrize("horizon_s", [1.0, 4.0])

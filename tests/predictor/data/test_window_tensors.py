@@ -51,7 +51,7 @@ def loop(windows: Windows, episodes: list[Episode], places: np.ndarray, history:
     """Window by window; the layout of `WindowBatch` in words."""
     chosen = [(episodes[e], now) for e, now in windows.index[places].tolist()]
     cuts = [cut_one(e, windows.spec, now, history, windows.horizon_steps) for e, now in chosen]
-    time, agents = max(c.last for c in cuts) + 1 + windows.horizon_steps, max(len(c.columns) for c in cuts)
+    time, agents = max(c.last for c in cuts) + 1 + windows.horizon_steps, max(1, *(len(c.columns) for c in cuts))
     states = np.zeros((len(cuts), time, agents, windows.spec.num_features), dtype=np.float32)
     valid = np.zeros((len(cuts), time, agents), dtype=np.bool_)
     for window, cut in enumerate(cuts):
@@ -198,12 +198,12 @@ def test_bytes_are_those_of_the_tensors():
 
 
 def test_a_window_without_anybody():
-    """Without a visible agent and without an ego, a batch has no columns."""
+    """Without a visible agent and without an ego, a batch has an absent one: networks compute nothing of none."""
     unseen = Episode(np.zeros((3, 2, 4), np.float32), np.zeros((3, 2), np.bool_), np.arange(2))
     windows = Windows([unseen], spec(has_ego=False), 2, 1)
-    assert windows.batch(np.array([0, 1])).states.shape == (2, 3, 0, 4)
+    assert windows.batch(np.array([0, 1])).states.shape == (2, 3, 1, 4)
     empty = replace(unseen, states=unseen.states[:, :0], valid=unseen.valid[:, :0], ids=unseen.ids[:0])
-    assert Windows([empty], spec(has_ego=False), 2, 1).batch(np.array([1])).valid.shape == (1, 3, 0)
+    assert Windows([empty], spec(has_ego=False), 2, 1).batch(np.array([1])).valid.tolist() == [[[False]] * 3]
 
 
 def test_absent_agents_hide_what_their_states_hold():

@@ -163,3 +163,14 @@ def test_help_has_the_description_and_every_field(capsys: pytest.CaptureFixture[
     assert stop.value.code == 0 and errors == ""
     for text in ("Reads settings.", "--num-envs", "Number of environments.", "--box.width", "Width of the box."):
         assert text in out
+
+
+@pytest.mark.parametrize("again", ["--out-paths", "--out_paths", "--out-paths=c"])
+def test_an_option_with_several_values_is_given_once(again: str):
+    """The later one would silently replace the earlier one; of a single value the last one counts, as elsewhere."""
+    words = ["--num-envs", "3", "--num-envs", "4", "--out-paths", "a", again, *([] if "=" in again else ["b"])]
+    with pytest.raises(
+        UserError, match=r"--out-paths is given 2 times; give all its values after one: --out-paths A B"
+    ):
+        parse(Settings, args=words)
+    assert parse(Settings, args=words[:6]) == Settings(4, ("a",))

@@ -63,6 +63,15 @@ def test_geometry_takes_the_new_scales_though_forecasts_move():
     assert not torch.allclose(forecasts(copy), forecasts(source), atol=1e-3)
 
 
+def test_scales_of_what_the_data_do_not_show_stay():
+    """Where no step has two agents, no neighbour is typical, and the network keeps its layers for geometry."""
+    source = any_model("dgvae-plural")
+    assert source.config.geometry_scales
+    copy = rescaled(source, "dgvae", SCALES | {"geometry_scales": ()}, 3)
+    assert copy.config.geometry_scales == source.config.geometry_scales
+    torch.testing.assert_close(forecasts(copy), forecasts(source), rtol=1e-4, atol=1e-4)
+
+
 def test_a_network_whose_other_layers_see_the_state_is_refused():
     with pytest.raises(UserError, match="refit_scales cannot keep what this network forecasts, it moves by"):
         rescaled(any_model("dgvae-rich"), "dgvae", SCALES, 3)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from predictor.checkpoint import load_checkpoint, save_checkpoint
+from predictor.data.device_windows import window_sizes
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
 from predictor.models import build, name_of
@@ -700,3 +701,26 @@ def test_a_start_that_does_not_fit_is_named(circles: Path, tmp_path: Path, chang
     first = str(train(config(circles, tmp_path / "first")))
     with pytest.raises(UserError, match=message.replace("RUN", first)):
         made(config(circles, tmp_path / "second", **({"init": first} | changes)))
+
+
+def test_windows_in_which_nobody_is_seen_are_not_trained_on(tmp_path: Path):
+    """Batches are sorted by their number of agents: some would have none, and their steps would teach nothing."""
+    episodes = []
+    for seed in range(6):
+        walk = circling_episode(seed, 4)
+        states, valid = (np.zeros((40, *part.shape[1:]), part.dtype) for part in (walk.states, walk.valid))
+        states[30:34], valid[30:34] = walk.states, walk.valid
+        episodes.append(replace(walk, states=states, valid=valid))
+    write_store(tmp_path / "street", StoreInfo(spec(has_ego=False), "street"), episodes)
+    settings = config(tmp_path / "street", tmp_path / "run", steps=8, preset="plural", set=("num_modes=2",))
+    data = load_data(settings)
+    assert all(window_sizes(windows).all() for windows in data.train) and not window_sizes(data.val[0]).all()
+    assert train(settings) == settings.out / "checkpoint"
+
+
+def test_a_recording_of_nobody_is_named(tmp_path: Path):
+    walks = [circling_episode(seed, 8) for seed in range(6)]
+    nobody = [replace(walk, states=0 * walk.states, valid=np.zeros_like(walk.valid)) for walk in walks]
+    write_store(tmp_path / "street", StoreInfo(spec(has_ego=False), "street"), nobody)
+    with pytest.raises(UserError, match="no agent is there in any window of the episodes for training"):
+        load_data(config(tmp_path / "street", tmp_path / "run"))
