@@ -87,9 +87,8 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
     tries = filter(None, (possible(world, sender, steps) for sender in _candidates(world, settings)))
     tried = [intervention for of_sender in islice(tries, settings.senders) for intervention in of_sender]
     point = BranchPoint(world, steps) if tried else None
-    if point is None or not point.plain.valid[-1].any():  # the episode ends within the horizon
-        return CausalLabels(ids, shift_m)
     for intervention in tried:
+        assert point is not None
         column = ids.index(intervention.agent)
         found = direct_shift_m(point, point.perturbed(intervention), settings.threshold_m)
         shift_m[:, column] = np.fmax(shift_m[:, column], found)

@@ -55,6 +55,9 @@ class DGVAEConfig:
     scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
     """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
+    changes_of_place: bool = False
+    """Whether a position's change is that of the agent's place on "centroid" axes as well, whose origin jumps when an
+    agent comes or goes. New networks have it there; checkpoints of before take the change in the frame."""
     geometry_scales: tuple[float, ...] = ()
     """Typical distance [m] and relative speed [m/s] of neighbours; if given, the geometry of each pair at these scales
     is an input of its edge and of its messages (`predictor.dgvae.geometry`)."""

@@ -23,12 +23,13 @@ class Reading:
     per_change: Tensor
     """Factor from scaled inputs to their typical change; of no use if changes are no input."""
 
-    def steps(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
-        """Encodes several steps after `past`."""
-        inputs, seen = self._with_changes(inputs, valid, past.seen)
+    def steps(self, states: Tensor, valid: Tensor, graph: Padded, past: Past) -> tuple[Tensor, Encoding]:
+        """Encodes several steps after `past`; returns the codec's inputs, too."""
+        own = self.codec.inputs(states, valid)
+        inputs, seen = self._with_changes(own, states, valid, past.seen)
         edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
         features, static = self._match(edges.features, graph.present, past.static)
-        return Encoding(edges, features, Past(edges.hidden, edges.cell, static, seen))
+        return own, Encoding(edges, features, Past(edges.hidden, edges.cell, static, seen))
 
     def step(
         self, layers: Layers, states: Tensor, valid: Tensor, graph: Padded | Packed, past: Past
@@ -36,7 +37,7 @@ class Reading:
         """Encodes one step: returns memory, prior logits and features after it."""
         inputs, seen = self.codec.inputs(states, valid), past.seen
         if self.config.change_scales:
-            steps, after = self._with_changes(inputs[:, None], valid[:, None], seen)
+            steps, after = self._with_changes(inputs[:, None], states[:, None], valid[:, None], seen)
             inputs, seen = steps[:, 0], after[:, 0]
         inputs = graph.pack_nodes(inputs)
         hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
@@ -47,15 +48,19 @@ class Reading:
             features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
         return Past(hidden, cell, static, seen), logits, features
 
-    def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+    def _with_changes(self, inputs: Tensor, states: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the encoder's inputs at several steps, and its memory of each one for the next."""
         if not self.config.change_scales:
             return inputs, inputs.new_zeros(*inputs.shape[:-1], 0)
-        seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
+        placed, axes = inputs, self.codec.spec.position_dim
+        if self.config.changes_of_place and self.codec.has_centroid:
+            origin = self.codec.centroid(states, valid) / self.codec.scales[:axes]
+            placed = torch.cat([inputs[..., :axes] + origin, inputs[..., axes:]], dim=-1)
+        seen = torch.cat([placed, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
         earlier = torch.cat([before[:, None], seen[:, :-1]], dim=1)
         known = earlier[..., -1:] * valid[..., None]
         features = self.codec.spec.num_features
-        changes = (inputs[..., :features] - earlier[..., :features]) * self.per_change * known
+        changes = (placed[..., :features] - earlier[..., :features]) * self.per_change * known
         return torch.cat([inputs, changes], dim=-1), seen
 
     def _match(self, features: Tensor, present: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:

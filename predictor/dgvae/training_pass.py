@@ -51,8 +51,8 @@ class TrainingPass:
         """Returns predictions and graphs; `nodes` and `pairs` are the memory before the first step."""
         decoder, self_edges = self.layers.decoder, self.layers.self_edges
         inferred = self._inferred(states, valid)
-        inputs, graph, (node, seen) = self.reading.codec.inputs(states, valid), self._graph(valid, inferred), nodes
-        edges, features, past = self.reading.steps(inputs, valid, graph, Past(*pairs, seen))
+        graph, (node, seen) = self._graph(valid, inferred), nodes
+        inputs, (edges, features, past) = self.reading.steps(states, valid, graph, Past(*pairs, seen))
         posterior = self.layers.encoder.posterior_logits(edges, graph.present, graph.senders)
         sampled = self.sampler(posterior)
         shown = self.reading.match_window(edges.features, features, graph.present)

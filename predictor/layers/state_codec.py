@@ -103,15 +103,27 @@ class StateCodec(nn.Module):
         axes = self.spec.position_dim
         positions, present = states[..., :axes], valid[..., None]
         centre = positions[..., :1, :] * self._ego_axes
-        if "centroid" in self.spec.frame:
-            total = torch.where(present, positions, 0.0).sum(-2, keepdim=True)
-            centre = centre + total / present.sum(-2, keepdim=True).clamp(min=1) * self._centroid_axes
+        if self.has_centroid:
+            centre = centre + self.centroid(states, valid)
         inputs = torch.cat([positions - centre, states[..., axes:]], dim=-1) / self.scales
         if self.spec.has_ego:
             mark = torch.zeros_like(inputs[..., :1])
             mark[..., 0, 0] = 1.0
             inputs = torch.cat([inputs, mark], dim=-1)
         return inputs * present
+
+    @property
+    def has_centroid(self) -> bool:
+        """Whether positions are relative to the mean of all agents, on some axis."""
+        return "centroid" in self.spec.frame
+
+    def centroid(
+        self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*#batch agents"]
+    ) -> Float[Tensor, "*batch 1 axes"]:
+        """Computes the mean position of those that are there [m], 0 on axes that are not relative to it."""
+        there = valid[..., None]
+        total = torch.where(there, states[..., : self.spec.position_dim], 0.0).sum(-2, keepdim=True)
+        return total / there.sum(-2, keepdim=True).clamp(min=1) * self._centroid_axes
 
     def advance(
         self, states: Float[Tensor, "*#batch state"], change: Float[Tensor, "*batch state"], fraction: float = 1.0

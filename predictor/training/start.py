@@ -25,10 +25,11 @@ def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episod
         UserError: --set names a field that the model does not have.
     """
     plain = configure(config.model, config.preset, config.set)
-    fitted = {"delta_scales": typical_change(episodes, spec, plain.residual)}
+    fitted: dict[str, Any] = {"delta_scales": typical_change(episodes, spec, plain.residual)}
     if config.model == "dgvae":
         if config.input_changes:
             fitted["change_scales"] = typical_change(episodes, spec, "state")
+            fitted["changes_of_place"] = "centroid" in spec.frame
         if config.fit_inputs:
             fitted["input_scales"] = typical_spread(episodes, spec)
         if config.edge_geometry:

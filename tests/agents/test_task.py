@@ -275,3 +275,18 @@ def test_unbounded_perception_is_a_task_of_a_policys_note():
     )
     with pytest.raises(UserError, match="perception_m must be positive, got -1"):
         Task("CartPole-v1", "forecast", checkpoint="constant-velocity", perception_m=-1.0)
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "simple_tag_v3"])
+def test_the_check_finds_own_entries_that_have_the_name_of_added_ones(env_id: str, monkeypatch: pytest.MonkeyPatch):
+    task, space = (
+        Task(env_id, "none"),
+        gym.spaces.Dict({"agents": gym.spaces.Box(0, 1, (2,)), "place": gym.spaces.Box(0, 1, (2,))}),
+    )
+    env = task.make()
+    monkeypatch.setattr(Task, "make", lambda self: env)
+    task.check()
+    of_agents = (lambda agent: space) if task.is_multiagent else space
+    monkeypatch.setattr(env, "observation_space", of_agents)
+    with pytest.raises(UserError, match="has an entry 'agents', as forecasts have; rename it"):
+        task.check()

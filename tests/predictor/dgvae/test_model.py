@@ -343,6 +343,26 @@ def test_encoder_sees_what_changed_since_the_last_step():
         torch.testing.assert_close(shown.pop(), inputs[:, [t]])
 
 
+@pytest.mark.parametrize(("of_place", "change"), [(True, [1.0, 2.0]), (False, [-19.0, 2.0])])
+def test_an_agent_that_comes_does_not_move_the_others(of_place: bool, change: list[float]):
+    """The mean of all agents, to which x is relative, jumps by 20 m; agent 0 moves by 1 m along x and 2 along y."""
+    torch.manual_seed(0)
+    config = replace(FAST_LIKE, change_scales=(1.0, 1.0, 1.0, 1.0), changes_of_place=of_place)
+    forecaster = DGVAE(spec(("centroid", "world"), has_ego=False), config, 3)
+    shown = []
+    forecaster.encoder.register_forward_pre_hook(lambda _, arguments: shown.append(arguments[0]))
+    states, valid = torch.zeros(1, 2, 2, 4), torch.tensor([[[True, False], [True, True]]])
+    states[0, 1, :, :2] = torch.tensor([[1.0, 2.0], [39.0, 0.0]])
+    forecaster.window(states, valid, torch.tensor([1]), 0)
+    window = shown.pop()
+    torch.testing.assert_close(window[0, 1, :, 4:6], torch.tensor([change, [0.0, 0.0]]))
+    torch.testing.assert_close(window[..., :4], forecaster.codec.inputs(states, valid))
+    memory = forecaster.empty_memory(1, 2)
+    for step in range(2):
+        memory, _ = forecaster.observe(memory, states[:, step], valid[:, step])
+        torch.testing.assert_close(shown.pop(), window[:, [step]])
+
+
 @pytest.mark.parametrize(
     ("scales", "must"),
     [((1.0, 2.0), "needs 4 positive numbers"), ((1.0, 0.0, 1.0, 1.0), "must be positive, finite numbers")],

@@ -724,3 +724,15 @@ def test_a_recording_of_nobody_is_named(tmp_path: Path):
     write_store(tmp_path / "street", StoreInfo(spec(has_ego=False), "street"), nobody)
     with pytest.raises(UserError, match="no agent is there in any window of the episodes for training"):
         load_data(config(tmp_path / "street", tmp_path / "run"))
+
+
+@pytest.mark.parametrize(("frame", "expected"), [("centroid", True), ("world", False)])
+def test_new_networks_see_changes_of_place(frame: Any, expected: bool, tmp_path: Path):
+    """Where the origin jumps; a network that is trained on keeps what it saw."""
+    store = StoreInfo(spec((frame, "world"), has_ego=False), "street")
+    write_store(tmp_path / "street", store, [circling_episode(seed) for seed in range(6)])
+    settings = config(tmp_path / "street", tmp_path / "run")
+    assert made(settings).model.config.changes_of_place == expected
+    old = train(replace(settings, set=("changes_of_place=false",)))
+    begun = made(config(tmp_path / "street", tmp_path / "next", init=str(old)))
+    assert begun.model.config.changes_of_place is False
