@@ -446,9 +446,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     case: str, in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     arguments, message = ERRORS[case]
-    base = ["--env-ids", ROAD, "--checkpoint", STILL, "--workers", "1", "--out", str(tmp_path / "results")]
+    base = {"--env-ids": ROAD, "--checkpoint": STILL, "--workers": "1", "--out": str(tmp_path / "results")}
+    words = [word for option in base.items() if option[0] not in arguments for word in option]
     monkeypatch.chdir(tmp_path)
-    code, errors, _ = run_command(evaluate.main, [*base, *arguments], monkeypatch, capsys)
+    code, errors, _ = run_command(evaluate.main, [*words, *arguments], monkeypatch, capsys)
     assert code == 2
     assert len(errors) == 1
     assert errors[0].startswith(f"error: {message}")

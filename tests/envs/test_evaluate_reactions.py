@@ -114,8 +114,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 ):
     arguments, message = ERRORS[case]
     monkeypatch.chdir(tmp_path)
-    base = ["--reactions", "--env-ids", TAG, "--checkpoint", STILL, "--workers", "1", "--out", "results"]
-    code, errors, _ = run_command(evaluate.main, [*base, *arguments], monkeypatch, capsys)
+    base = {"--env-ids": TAG, "--checkpoint": STILL, "--workers": "1", "--out": "results"}
+    words = [word for option in base.items() if option[0] not in arguments for word in option]
+    code, errors, _ = run_command(evaluate.main, ["--reactions", *words, *arguments], monkeypatch, capsys)
     assert (code, len(errors)) == (2, 1)
     assert errors[0].startswith(f"error: {message}")
     assert list(tmp_path.iterdir()) == []
