@@ -138,7 +138,7 @@ class OffPolicyPreset(Preset):
     buffer_size: int = 15_000
     """Number of transitions kept."""
     learning_starts: int = 200
-    """Number of random transitions before the first update."""
+    """Number of environment steps with random actions before the first update."""
     batch_size: int = 32
     """Number of samples per gradient step."""
     train_freq: int = 1
