@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Collection, Sequence
 from dataclasses import MISSING, dataclass, fields
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 from docstring_parser import parse_from_object
@@ -78,11 +78,15 @@ def _check_given_once(config_class: type, words: Sequence[str]) -> None:
         UserError: one is.
     """
     hints = get_type_hints(config_class)
-    several = {field.name.replace("_", "-") for field in fields(config_class) if "tuple" in str(hints[field.name])}
+    several = {name.replace("_", "-") for name, hint in hints.items() if _is_tuple(hint)}
     given = [word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
     for name in given:
         if name in several and given.count(name) > 1:
             raise UserError(f"--{name} is given {given.count(name)} times; give all its values after one: --{name} A B")
+
+
+def _is_tuple(hint: Any) -> bool:
+    return get_origin(hint) is tuple or any(map(_is_tuple, get_args(hint)))
 
 
 def _seldom_used(config_class: type) -> list[str]:

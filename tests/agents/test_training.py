@@ -133,7 +133,8 @@ def test_steps_that_teach_nothing_are_refused():
         UserError, match=r"dqn makes its first update after learning_starts=200 steps, so 200 steps teach"
     ):
         plan(algorithm="dqn", steps=200)
-    assert plan(algorithm="dqn", steps=201).steps == plan(algorithm="dqn", steps=201, settings={}).steps
+    assert plan(algorithm="dqn", steps=201).steps == 201
+    assert plan(algorithm="dqn", steps=200, settings={"learning_starts": 199}).steps == 200
 
 
 @pytest.mark.parametrize("every_steps", [2, 8])

@@ -7,6 +7,7 @@ from stable_baselines3 import PPO
 from agents.presets import PPOPreset, QRDQNPreset
 from agents.studies.cells import NETWORK, Cell, cells_of
 from agents.studies.plan import read_study
+from envs.drivers.content import content_of_module
 from envs.drivers.planner import PlannerConfig
 from envs.registry import make_env
 from predictor.support.errors import UserError
@@ -169,6 +170,12 @@ def test_what_cannot_run_is_said_before_anything_runs(
 def test_the_code_of_an_environment_of_ones_own_is_in_the_name(
     cells: Callable[..., list[Cell]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.syspath_prepend(tmp_path)
+    found = list[str | None]()
+    for number in (0, 1):
+        (tmp_path / "my_study_env.py").write_text(f"REWARD = {number}\n")
+        found.append(content_of_module("my_study_env:Own-v0"))
+    assert None not in found and found[0] != found[1] and content_of_module("merge-v1") is None
     before = {cell.title: cell.name for cell in cells()}
     monkeypatch.setattr("agents.studies.cells.content_of_module", lambda env_id: f"sha of {env_id}")
     after = {cell.title: cell.name for cell in cells()}
