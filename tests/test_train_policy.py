@@ -444,11 +444,11 @@ def test_interrupted_run_goes_on_where_it_was(
 @pytest.mark.slow
 def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     run = tmp_path / "run"
-    arguments = [*DQN[:-1], "80", "--out", str(run), "--no-video"]
+    arguments = [*DQN[:-1], "80", "--set", "learning_starts=10", "--out", str(run), "--no-video"]
     root = Path(train_policy.__file__).parent
-    process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root)
     while not (run / "checkpoint.zip").exists():
-        assert process.poll() is None
+        assert process.poll() is None, "it ended before its first checkpoint; what it said is above"
         time.sleep(0.05)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
