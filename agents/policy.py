@@ -19,6 +19,7 @@ from agents.task import Task, task_of
 from agents.vec_envs import DrivenEnv
 from envs.drivers.trained import env_for_driver, parallel_env_for_driver
 from envs.own_observation import carries_forecasts
+from envs.registry import arguments_of
 from envs.sb3 import policy_file
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.sb3.padded_spaces import learners_named
@@ -200,15 +201,24 @@ def require_env_of(zipped: Path, task: Task) -> None:
     """Checks that a policy was trained in the environment of the config beside it, as its note says.
 
     Raises:
-        UserError: it was not.
+        UserError: it was not, or with other arguments, learners or drivers.
     """
     note = read_policy_note(zipped)
-    trained = "" if note is None else note.env_id
-    if trained and trained != task.env_id:
-        raise UserError(
-            f"{zipped} was trained on {short(trained, 80)}, but {CONFIG_FILE} beside it is that of a run on "
-            f"{task.env_id}; move the policy into a folder of its own"
-        )
+    if note is None or not note.env_id:
+        return
+    trained, found = note.env_id, task.env_id
+    if trained == found:
+        driven = {name: (getattr(note, name), getattr(task, name)) for name in ("learners", "driver")}
+        arguments = (arguments_of(note.env_kwargs), task.make_kwargs)
+        parts = {"env_kwargs": arguments} | (driven if task.is_multiagent else {})
+        other = next((name for name, (of_note, of_run) in parts.items() if of_note != of_run), None)
+        if other is None:
+            return
+        trained, found = (f"{task.env_id} with {other} {value or 'none'}" for value in parts[other])
+    raise UserError(
+        f"{zipped} was trained on {short(trained, 120)}, but {CONFIG_FILE} beside it is that of a run on "
+        f"{short(found, 120)}; move the policy into a folder of its own"
+    )
 
 
 def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:

@@ -22,18 +22,23 @@ class FieldEnv(ParallelEnv):
         """Name the runners."""
         self.possible_agents = [f"runner_{i}" for i in range(RUNNERS)]
         self.agents: list[str] = []
+        self.seen = {a: gym.spaces.Box(-np.inf, np.inf, (6,), np.float32) for a in self.possible_agents}
+        self.pushes = {a: gym.spaces.Box(-1.0, 1.0, (2,), np.float32) for a in self.possible_agents}
+        self.rng = np.random.default_rng()
 
     def observation_space(self, agent: str) -> gym.Space:
         """Where the runner is, how fast, and where its place is."""
-        return gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
+        return self.seen[agent]
 
     def action_space(self, agent: str) -> gym.Space:
         """Acceleration along x and y."""
-        return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        return self.pushes[agent]
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict, dict]:
-        """Put the runners and their places anywhere."""
-        rng = np.random.default_rng(seed)
+        """Put the runners and their places anywhere; without a seed, go on with the random numbers of before."""
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        rng = self.rng
         self.time, self.agents = 0, list(self.possible_agents)
         self.bodies = {a: np.concatenate([rng.uniform(-8, 8, 2), rng.normal(size=2)]) for a in self.agents}
         self.places = {a: rng.uniform(-8, 8, 2) for a in self.agents}

@@ -51,9 +51,9 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
         raise UserError(f"the video {path} needs at least one picture, got none; play at least one step")
     _try_to_write(path)
     try:
-        with new_file(path) as partial:
+        with new_file(path) as partial:  # absolute, as ffmpeg takes "a:" at the beginning for a protocol
             writer = imageio_ffmpeg.write_frames(
-                partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
+                partial.absolute(), first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
             )
             with closing(writer):
                 writer.send(None)

@@ -90,6 +90,10 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
         self._viewer: Any = None
         self._steps, self._return, self._reward, self._crashed = 0, 0.0, 0.0, False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out highway-env's window, which cannot be copied; a copy opens its own."""
+        return self.__dict__ | {"_viewer": None}
+
     @property
     def render_mode(self) -> str:  # type: ignore[override]  # gymnasium.Wrapper has a property, too
         """Always "rgb_array"."""

@@ -68,6 +68,14 @@ def test_a_zip_beside_the_config_of_another_run_is_refused(tmp_path: Path, monke
         evaluate.main()
 
 
+def test_a_zip_beside_the_config_of_other_arguments_is_refused(tmp_path: Path):
+    saved(tmp_path, Task(FAST, "none", env_kwargs=FEW), run=True)
+    other, _ = saved(tmp_path, Task(FAST, "none"))
+    message = "trained on highway-fast-v0 with env_kwargs none, but config.json beside it is that of a run on highway"
+    with pytest.raises(UserError, match=message):
+        load_policy(other)
+
+
 @pytest.mark.filterwarnings("ignore:.* has no note")
 @pytest.mark.parametrize("noted", [True, False])
 def test_a_run_folder_is_enough(noted: bool, tmp_path: Path):

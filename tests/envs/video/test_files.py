@@ -23,6 +23,12 @@ def test_files_are_named_by_strings_or_paths(kind: type, tmp_path: Path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["x.mp4", "x.png"]
 
 
+def test_the_first_folder_of_a_relative_path_may_have_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    write_video("pkg:Env-ppo/x.mp4", [PICTURE] * 4, fps=4)
+    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "pkg:Env-ppo" / "x.mp4")[0] == 4
+
+
 def test_a_video_without_pictures_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="needs at least one picture, got none; play at least one step"):
         write_video(tmp_path / "x.mp4", [], fps=4)
