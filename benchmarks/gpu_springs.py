@@ -146,21 +146,26 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
     config.suite.check_stores()
     folder, file = line_folder(config.suite, LINE), config.out / "summary.json"
     before, result = _steps_done(folder / "run"), folder / "result.json"
-    if result.exists() and file.exists() and (known := read_object(file))["config"] == _plain(config):
-        return known  # the steps of its last call are known to that call alone
-    measured = json.loads(result.read_text()) if result.exists() else run_line(config.suite, LINE)
+    finished = result.exists()
+    known = read_object(file) if finished and file.exists() else {}
+    if known and known["config"] == _plain(config):
+        return known
+    measured = json.loads(result.read_text()) if finished else run_line(config.suite, LINE)
     steps = config.suite.sizes.steps
     minutes = measured["train_seconds"] / 60
+    device: Any = torch.cuda.get_device_name() if config.device.startswith("cuda") else processor()
+    # device and steps of a finished training's last call are known to that call alone
+    device, last = (known.get("device"), known.get("steps_of_the_last_call")) if finished else (device, steps - before)
     test = measured["tests"]["test"]
     summary = {
-        "device": torch.cuda.get_device_name() if config.device.startswith("cuda") else processor(),
+        "device": device,
         "steps": steps,
-        "steps_of_the_last_call": steps - before if before < steps else steps,
+        "steps_of_the_last_call": last,
         "train_minutes_of_the_last_call": minutes,
-        "steps_per_s_with_validation": (steps - before if before < steps else steps) / measured["train_seconds"],
+        "steps_per_s_with_validation": None if last is None else last / measured["train_seconds"],
         "measure_minutes": measured["measure_seconds"] / 60,
         "data_seconds": made,
-        "below_target": minutes <= config.target_minutes if before == 0 or before >= steps else None,
+        "below_target": minutes <= config.target_minutes if last == steps else None,
         "min_ade_m": test["horizon_only"]["min_ade_m"],
         "graph_accuracy": test["graph"]["accuracy"],
         "tests": measured["tests"],
@@ -374,9 +379,11 @@ def main() -> None:
         print(f"written to {config.out / 'projection.json'}")
         return
     summary = run(config)
+    last, speed = summary["steps_of_the_last_call"], summary["steps_per_s_with_validation"]
+    of_call = "an unknown number of" if last is None else f"{last:,}"
+    rate = "" if last is None else f" ({speed:.1f} steps/s, validation included) on {summary['device']}"
     print(
-        f"{summary['steps_of_the_last_call']:,} steps in {summary['train_minutes_of_the_last_call']:.1f} minutes "
-        f"({summary['steps_per_s_with_validation']:.1f} steps/s, validation included) on {summary['device']}; "
+        f"{of_call} steps in {summary['train_minutes_of_the_last_call']:.1f} minutes{rate}; "
         f"minADE {summary['min_ade_m']:.4f} m, graph accuracy {summary['graph_accuracy']:.3f}"
     )
     print(f"written to {config.out / 'summary.json'}")

@@ -16,6 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from predictor.support.runtime import prefer_onednn
+
 _MALLOC = "MALLOC_"
 
 
@@ -151,10 +153,11 @@ TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "foreca
 
 
 def main() -> None:
-    """Answers requests until the input ends."""
+    """Answers requests until the input ends; products are computed by the library that the parent takes."""
     import torch
 
     torch.set_num_threads(int(sys.argv[1]))
+    prefer_onednn()
     for line in sys.stdin:
         request = json.loads(line)
         try:

@@ -27,14 +27,15 @@ class VmasEnv(ParallelEnv):
         self.metadata = {**self.metadata, "name": f"vmas_{scenario}"}
         self.vmas = vmas.make_env(scenario, num_envs=1, max_steps=max_steps, dict_spaces=True, **kwargs)
         self.possible_agents, self.agents = [agent.name for agent in self.vmas.agents], []
+        self._seen, self._pushes = (_spaces(s) for s in (self.vmas.observation_space, self.vmas.action_space))
 
     def observation_space(self, agent: str) -> gym.Space:
         """VMAS's own space of the agent, which is one of gym, as one of gymnasium."""
-        return self._spaces(self.vmas.observation_space)[agent]
+        return self._seen[agent]
 
     def action_space(self, agent: str) -> gym.Space:
         """The same of its actions."""
-        return self._spaces(self.vmas.action_space)[agent]
+        return self._pushes[agent]
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict, dict]:
         """Begin an episode."""
@@ -46,17 +47,19 @@ class VmasEnv(ParallelEnv):
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """Let all agents act."""
         pushes = {agent: torch.as_tensor(np.asarray(push))[None] for agent, push in actions.items()}
-        seen, rewards, done, _ = self.vmas.step(pushes)
-        over = {agent: bool(done[0]) for agent in self.agents}
+        seen, rewards, done, _ = self.vmas.step(pushes)  # done at the goal, and at the limit of steps
+        reached = bool(self.vmas.scenario.done()[0])
+        ended, over = (dict.fromkeys(self.agents, flag) for flag in (reached, bool(done[0]) and not reached))
         infos: dict[str, dict] = {agent: {} for agent in self.agents}
         self.agents = [] if done[0] else self.agents
-        return self._arrays(seen), {a: float(r[0]) for a, r in rewards.items()}, over, dict.fromkeys(over, False), infos
-
-    def _spaces(self, of_gym: Any) -> dict[str, gym.Space]:
-        return {agent: gym.spaces.Box(s.low, s.high, dtype=np.float32) for agent, s in of_gym.items()}
+        return self._arrays(seen), {a: float(r[0]) for a, r in rewards.items()}, ended, over, infos
 
     def _arrays(self, seen: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
         return {agent: rows[0].numpy().astype(np.float32) for agent, rows in seen.items()}
+
+
+def _spaces(of_gym: Any) -> dict[str, gym.Space]:
+    return {agent: gym.spaces.Box(s.low, s.high, dtype=np.float32) for agent, s in of_gym.items()}
 
 
 class VmasReader:

@@ -81,6 +81,11 @@ def test_a_run_that_was_stopped_goes_on(small: GpuSpringsConfig, monkeypatch: py
     assert (summary["steps"], summary["steps_of_the_last_call"]) == (3, 1)
     assert summary["below_target"] is None
     assert script.run(whole) == json.loads(json.dumps(summary))  # not three steps in the time of one
+    other = script.run(replace(whole, target_minutes=1e6))
+    names = ("device", "steps_of_the_last_call", "steps_per_s_with_validation", "below_target")
+    assert [other[name] for name in names] == [summary[name] for name in names]
+    (whole.out / "summary.json").unlink()
+    assert [script.run(whole)[name] for name in names] == [None] * 4
 
 
 def test_only_missing_splits_are_made(small: GpuSpringsConfig):

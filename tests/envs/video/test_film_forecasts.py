@@ -1,5 +1,6 @@
 """Forecasts in `env.render()`, in highway-env's pictures and in those of an environment of one's own."""
 
+import copy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -176,3 +177,13 @@ def test_without_a_screen_one_sentence_says_what_to_do(monkeypatch: pytest.Monke
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     with pytest.raises(UserError, match="cannot open a window: .*; leave out --window to write a film"):
         window.play([WHITE], 10.0, "yard")
+
+
+def test_a_copy_after_a_picture_goes_on_alike():
+    env = FilmForecasts(ForecastObservation(gym.make("highway-fast-v0", render_mode="rgb_array"), "constant-velocity"))
+    env.reset(seed=0)
+    env.render()
+    twin = copy.deepcopy(env)
+    for each in (env, twin):
+        each.step(1)
+    np.testing.assert_array_equal(env.render(), twin.render())
