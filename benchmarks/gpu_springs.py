@@ -153,9 +153,9 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
     measured = json.loads(result.read_text()) if finished else run_line(config.suite, LINE)
     steps = config.suite.sizes.steps
     minutes = measured["train_seconds"] / 60
-    device: Any = torch.cuda.get_device_name() if config.device.startswith("cuda") else processor()
+    here = torch.cuda.get_device_name() if config.device.startswith("cuda") else processor()
     # device and steps of a finished training's last call are known to that call alone
-    device, last = (known.get("device"), known.get("steps_of_the_last_call")) if finished else (device, steps - before)
+    device, last = (known.get("device"), known.get("steps_of_the_last_call")) if finished else (here, steps - before)
     test = measured["tests"]["test"]
     summary = {
         "device": device,
