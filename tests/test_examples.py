@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import parallel_seed_test
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 import dgvae_rl
@@ -281,6 +282,17 @@ def test_arguments_reach_the_circle():
     assert len(episode.ids) == 4
     with pytest.raises(UserError, match="cannot make env .* with {'people': 0}: ValueError: people must be at least 1"):
         list(collect(replace(config, env_kwargs='{"people": 0}')))
+
+
+def test_the_field_is_the_same_from_a_seed():
+    from field_env import FieldEnv
+
+    parallel_seed_test(FieldEnv)
+    first, second = FieldEnv(), FieldEnv()
+    for env in (first, second):
+        env.reset(seed=0)
+    (one, _), (other, _) = first.reset(), second.reset()
+    np.testing.assert_equal(one, other)
 
 
 def test_the_examples_of_other_packages_are_python():
