@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from stable_baselines3 import PPO
 
 from agents import evaluate
 from agents.arena import MultiagentArena
-from agents.policy import CountedEpisodes, TrainedPolicy, is_recurrent, load_policy, task_of_policy
+from agents.policy import CountedEpisodes, TrainedPolicy, is_recurrent, load_policy, require_env_of, task_of_policy
 from agents.runs import policy_zip, save_model
 from agents.task import Observe, Task
 from envs.parallel import ForecastParallelEnv
@@ -74,6 +75,15 @@ def test_a_zip_beside_the_config_of_other_arguments_is_refused(tmp_path: Path):
     message = "trained on highway-fast-v0 with env_kwargs none, but config.json beside it is that of a run on highway"
     with pytest.raises(UserError, match=message):
         load_policy(other)
+
+
+@pytest.mark.parametrize("other", [{"driver": "random"}, {"learners": ("agent",)}], ids=str)
+def test_a_team_beside_the_config_of_other_learners_or_drivers_is_refused(other: dict, tmp_path: Path):
+    task = Task(TAG, "none", learners=("adversary",), driver="heuristic")
+    save_model(policy_for(task), tmp_path / "policy.zip", note=task.note)
+    require_env_of(tmp_path / "policy.zip", task)
+    with pytest.raises(UserError, match=f"trained on {TAG} with {next(iter(other))} .*; move the policy into a folder"):
+        require_env_of(tmp_path / "policy.zip", replace(task, **other))
 
 
 @pytest.mark.filterwarnings("ignore:.* has no note")

@@ -1,6 +1,9 @@
+import io
+import sys
 from typing import Any
 
 import pytest
+import torch
 
 from benchmarks import worker_process
 from benchmarks.worker_process import WorkerProcess, exact_memory, peak_rise
@@ -34,3 +37,13 @@ def test_memory_that_proc_lacks_is_none(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(worker_process, "_status_bytes", lacking)
     assert peak_rise(lambda: None) is None
+
+
+def test_a_worker_takes_the_products_of_its_parent(monkeypatch: pytest.MonkeyPatch):
+    """Else what is said of the allocator is in part said of the library of products."""
+    taken: list[str] = []
+    monkeypatch.setattr(worker_process, "prefer_onednn", lambda: taken.append("products"))
+    monkeypatch.setattr(sys, "argv", ["worker_process", str(torch.get_num_threads())])
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    worker_process.main()
+    assert taken == ["products"]
