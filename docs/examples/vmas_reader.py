@@ -25,7 +25,8 @@ class VmasEnv(ParallelEnv):
     def __init__(self, scenario: str = "navigation", max_steps: int = 100, **kwargs: Any) -> None:
         """Make the scenario."""
         self.metadata = {**self.metadata, "name": f"vmas_{scenario}"}
-        self.vmas = vmas.make_env(scenario, num_envs=1, max_steps=max_steps, dict_spaces=True, **kwargs)
+        options = {"dict_spaces": True, "terminated_truncated": True, "max_steps": max_steps, **kwargs}
+        self.vmas = vmas.make_env(scenario, num_envs=1, **options)
         self.possible_agents, self.agents = [agent.name for agent in self.vmas.agents], []
         self._seen, self._pushes = (_spaces(s) for s in (self.vmas.observation_space, self.vmas.action_space))
 
@@ -47,11 +48,10 @@ class VmasEnv(ParallelEnv):
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """Let all agents act."""
         pushes = {agent: torch.as_tensor(np.asarray(push))[None] for agent, push in actions.items()}
-        seen, rewards, done, _ = self.vmas.step(pushes)  # done at the goal, and at the limit of steps
-        reached = bool(self.vmas.scenario.done()[0])
-        ended, over = (dict.fromkeys(self.agents, flag) for flag in (reached, bool(done[0]) and not reached))
+        seen, rewards, *ends, _ = self.vmas.step(pushes)  # at the goals, at the limit of steps
+        ended, over = (dict.fromkeys(self.agents, bool(end[0])) for end in ends)
         infos: dict[str, dict] = {agent: {} for agent in self.agents}
-        self.agents = [] if done[0] else self.agents
+        self.agents = [] if any(end[0] for end in ends) else self.agents
         return self._arrays(seen), {a: float(r[0]) for a, r in rewards.items()}, ended, over, infos
 
     def _arrays(self, seen: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
