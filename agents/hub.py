@@ -25,7 +25,8 @@ _HEADER = "---\nlibrary_name: dgvae-rl\ntags:\n- reinforcement-learning\n- stabl
 def push_policy_to_hub(path: str | Path, repository: str, private: bool = False) -> str:
     """Writes a policy into a repository of the hub; returns the repository's address.
 
-    Its run's config.json and summary.json go with it, and a card that warns of the pickle.
+    Its run's config.json and summary.json go with it, and a card that warns of the pickle. Those of a policy that was
+    pushed there before are removed in the same commit where this one has none.
 
     Args:
         path: run folder of train_policy.py, or a policy's ``.zip``.
@@ -47,7 +48,9 @@ def push_policy_to_hub(path: str | Path, repository: str, private: bool = False)
         if Path(path).is_dir() and (zipped.parent / file).exists():
             check_regular(zipped.parent / file, most)
             content[file] = zipped.parent / file
-    return push(zipped, repository, private, f"Policy of {note.env_id or 'an environment'}", content)
+    # those of a policy that was there before would be taken for this one's
+    superseded = [file for file in (CONFIG_FILE, SUMMARY_FILE) if file not in content]
+    return push(zipped, repository, private, f"Policy of {note.env_id or 'an environment'}", content, superseded)
 
 
 def policy_from_hub(name: str, trust_pickle: bool = False) -> Path:

@@ -5,7 +5,7 @@ import hashlib
 import json
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -39,11 +39,12 @@ class Hub:
     released: threading.Event = field(default_factory=threading.Event)
     """Set at the end, so that no request waits any longer."""
 
-    def commit(self, repository: str, **files: bytes) -> str:
+    def commit(self, repository: str, removed: Collection[str] = (), **files: bytes) -> str:
         """Adds a commit with these files, `__` for a dot, over those of the commit before; returns its hash."""
         named = {name.replace("__", "."): content for name, content in files.items()}
         commits = self.repositories.setdefault(repository, {})
-        whole = {**(list(commits.values())[-1] if commits else {}), **named}
+        before = list(commits.values())[-1] if commits else {}
+        whole = {name: content for name, content in before.items() if name not in removed} | named
         sha = hashlib.sha1(repr((repository, len(commits), sorted(whole.items()))).encode()).hexdigest()
         commits[sha] = whole
         return sha
@@ -146,7 +147,10 @@ class _Handler(BaseHTTPRequestHandler):
                 for line in lines
                 if line["key"] == "file"
             }
-            sha = self.hub.commit(found[1], **written)
+            removed = {line["value"]["path"] for line in lines if line["key"] == "deletedFile"}
+            if not removed <= set(self.hub.files(found[1])):
+                return self._answer(400)
+            sha = self.hub.commit(found[1], removed, **written)
             self._json({"commitUrl": f"{self.hub.address}/{found[1]}/commit/{sha}", "commitOid": sha, "success": True})
         else:
             self._answer(404)

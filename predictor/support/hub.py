@@ -8,7 +8,7 @@ environment variables of that package hold: HF_ENDPOINT is the hub, HF_HUB_CACHE
 import importlib.util
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +102,14 @@ def fetch(name: str | Path, files: Mapping[str, int], optional: Mapping[str, int
     return folder
 
 
-def push(folder: Path, repository: str, private: bool, message: str, content: Mapping[str, bytes | Path]) -> str:
+def push(
+    folder: Path,
+    repository: str,
+    private: bool,
+    message: str,
+    content: Mapping[str, bytes | Path],
+    superseded: Collection[str] = (),
+) -> str:
     """Writes files into a repository in one commit; makes the repository if there is none. Returns its address.
 
     Args:
@@ -111,6 +118,7 @@ def push(folder: Path, repository: str, private: bool, message: str, content: Ma
         private: whether a new repository is private.
         message: message of the commit.
         content: content or path of each file, by its name.
+        superseded: names of files of earlier pushes that the same commit removes; others in the repository stay.
 
     Raises:
         UserError: the extra is missing, the name is none, the hub cannot be reached, or refuses.
@@ -118,7 +126,7 @@ def push(folder: Path, repository: str, private: bool, message: str, content: Ma
     wanted, hub = hub_name(f"{PREFIX}{repository.removeprefix(PREFIX)}"), _library()
     if wanted.revision is not None:
         raise UserError(f"'{repository}' names a revision; push to owner/name")
-    operations = [
+    operations: list[Any] = [
         hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=str(data) if isinstance(data, Path) else data)
         for name, data in content.items()
     ]
@@ -126,6 +134,9 @@ def push(folder: Path, repository: str, private: bool, message: str, content: Ma
     try:
         with _errors_of(wanted, hub, short(folder)), _short_waits(hub):
             api.create_repo(wanted.repository, private=private, exist_ok=True)
+            if superseded:  # a hub refuses to remove what is not there
+                there = {file.rfilename for file in api.model_info(wanted.repository).siblings or ()}
+                operations += [hub.CommitOperationDelete(name) for name in superseded if name in there]
             api.create_commit(wanted.repository, operations, commit_message=message)
     except _NoNetwork as error:
         raise UserError(f"{short(folder)} was not pushed: {error}") from error

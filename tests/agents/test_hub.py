@@ -97,6 +97,19 @@ def test_what_is_pushed_as_private_stays_private(what: str, hub: Hub, tmp_path: 
     assert hub.private == {"me/secret"}
 
 
+def test_a_policy_does_not_keep_the_config_of_another_one(hub: Hub, tmp_path: Path):
+    saved(tmp_path / "run", Task(FAST, "none", env_kwargs=FEW), run=True)
+    (tmp_path / "run" / "summary.json").write_text("{}")
+    push_policy_to_hub(tmp_path / "run", "me/fast")
+    hub.commit("me/fast", notes__txt=b"mine")
+    assert sorted(hub.files("me/fast")) == ["README.md", "config.json", "notes.txt", "policy.zip", "summary.json"]
+    alone, _ = saved(tmp_path / "alone", Task(FAST, "none"))
+    push_policy_to_hub(alone, "me/fast")
+    assert sorted(hub.files("me/fast")) == ["README.md", "notes.txt", "policy.zip"]
+    assert hub.files("me/fast")["policy.zip"] == alone.read_bytes()
+    assert load_policy("hub:me/fast", trust_pickle=True)[1].unwrapped.config["vehicles_count"] > 0
+
+
 def test_a_predictor_is_no_policy(hub: Hub):
     hub.commit("me/merge", config__json=b"{}")
     with pytest.raises(UserError, match="hub:me/merge has no policy.zip and is not what is asked for"):
