@@ -131,7 +131,8 @@ class TrainPolicyConfig:
     """Continue the run in `out`, or start it if the folder holds none."""
     selections: int = 8
     """Number of times that the policy is measured for model selection, evenly spread as far as its updates allow: a
-    measurement comes after an update, and the last one after the last."""
+    measurement comes after an update, and the last one after the last. The model with the highest mean return is
+    kept, of equal ones the latest."""
     selection_episodes: int | None = None
     """Number of episodes per such measurement, on seeds that neither training nor the final table uses. None takes 20,
     in mpe2's particle worlds 100."""

@@ -145,19 +145,3 @@ def mean_of_known(values: Sequence[float]) -> float:
     """Returns the mean of the values that are not NaN; NaN if all are."""
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else math.nan
-
-
-def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
-    """Returns whether `returns` are significantly lower than `best`.
-
-    They are if the 95 % normal interval of the mean paired difference lies below zero; with one episode, never.
-
-    Args:
-        returns: returns of a model, one per seed.
-        best: returns of another model on the same seeds, in the same order.
-    """
-    difference = np.subtract(returns, best)
-    if len(difference) < 2:
-        return False
-    error = difference.std(ddof=1) / np.sqrt(len(difference))
-    return bool(difference.mean() + NORMAL_95 * error < 0)

@@ -1,7 +1,7 @@
 """Trains an SB3 policy: preset, parallel environments, model selection on separate seeds, resumable checkpoints.
 
-`policy.zip` is the latest model that is not significantly worse on the selection seeds than the best one measured.
-Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
+`policy.zip` is the model with the highest mean return on the selection seeds, of equal ones the latest. Those seeds are
+disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
 from agents.step_count import CountSteps, StepProgress
-from agents.summaries import mean_of_known, significantly_worse
+from agents.summaries import mean_of_known
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
@@ -267,11 +267,10 @@ class SaveCheckpoint(BaseCallback):
 
 
 class SelectBest(BaseCallback):
-    """Keeps the latest model that is not significantly worse than the best one measured, with its result inside.
+    """Keeps the model with the highest mean return so far, of equal ones the latest, with its result inside.
 
-    With few episodes the highest of several means is mostly noise. A later model, which was trained for longer,
-    therefore replaces the kept one unless it is `significantly_worse` than the model with the highest mean so far.
-    Comparing with that one, not with the kept one, prevents that small losses add up.
+    Over few episodes that mean is higher than what the model returns elsewhere, as it is the highest of several noisy
+    ones.
 
     Measurements are made between updates and at the end, so that all that was collected has been learned from. In the
     list of callbacks they stand before `SaveCheckpoint`, whose file then has them.
@@ -310,7 +309,7 @@ class SelectBest(BaseCallback):
         self._scalars, self._say = scalars, say
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at, self._kept_at = 0, -1
-        self._highest: list[float] = []
+        self._highest = -math.inf
         self._points: list[dict[str, Any]] = []
         self._since = time.perf_counter()
 
@@ -326,10 +325,11 @@ class SelectBest(BaseCallback):
     def _on_training_start(self) -> None:
         """Continues from the results inside an existing file."""
         self._measured_at = begun = self.model.num_timesteps
-        try:  # with nothing to go on from, a model of before is one of another training
-            self._highest = list(read_note(self._path).get("highest_returns", [])) * bool(begun)
+        try:
+            stored = read_note(self._path).get("selection_return", -math.inf)
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
+        self._highest = stored if begun else -math.inf  # with nothing to go on from, it is that of another training
         if self._curve is not None:
             self._points = [p for p in read_curve(self._curve) if p["steps"] <= begun]
             self._measured_at = self._points[-1]["steps"] if self._points else 0
@@ -347,7 +347,7 @@ class SelectBest(BaseCallback):
             self._measure()
 
     def _measure(self) -> None:
-        """Plays the seeds, keeps the model unless it is worse, and adds a point to the curve.
+        """Plays the seeds, keeps the model unless an earlier one is better, and adds a point to the curve.
 
         Raises:
             DivergedError: the weights are not finite; algorithms that learn values go on with those unnoticed.
@@ -359,8 +359,8 @@ class SelectBest(BaseCallback):
         for name, value in scalars.items():
             self.logger.record(f"loop/{name}", value)
         self._keep(results, mean)
-        best = float(np.mean(self._highest))
-        self._say(f"step {self.num_timesteps:,}: return {mean:.2f} over {len(results)} episodes (best {best:.2f})")
+        said = f"return {mean:.2f} over {len(results)} episodes (best {self._highest:.2f})"
+        self._say(f"step {self.num_timesteps:,}: {said}")
         if self._curve is not None:
             point = {"steps": self.num_timesteps, "return": mean, "episodes": len(results), "seconds": self._learned_s}
             self._points.append(point | scalars)
@@ -368,19 +368,16 @@ class SelectBest(BaseCallback):
         self._since = time.perf_counter()
 
     def _keep(self, results: Sequence[EpisodeResult], mean: float) -> None:
-        returns = [r.episode_return for r in results]
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
         for name, value in driving_scalars(results).items():
             self.logger.record(f"eval/{name}", value)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-        comparable = len(self._highest) == len(returns)
-        if comparable and significantly_worse(returns, self._highest):
+        if mean < self._highest:
             return
-        if not comparable or mean > np.mean(self._highest):
-            self._highest = returns
-        extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
+        self._highest = mean
+        extra = {"selection_return": mean, "steps": self.num_timesteps}
         save_model(self.model, self._path, extra, self._note)
         self._kept_at = self.num_timesteps
 

@@ -122,6 +122,8 @@ class Cell:
             unrelated.add("shaping")
         if self.plan.steps % self.plan.selections:  # where they do not divide, measurements once lay elsewhere
             content["selections"] = "in equal parts"
+        if self.plan.selections > 1:  # the latest one that was not significantly worse was once kept
+            content["kept"] = "highest mean"
         values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
         return content | {"plan": values, "preset": _named(self.plan.preset)}
 

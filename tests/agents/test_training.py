@@ -1,7 +1,6 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from agents.presets import (
     preset_for,
 )
 from agents.runs import load_model, save_model
-from agents.summaries import significantly_worse
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import (
     SaveCheckpoint,
@@ -182,43 +180,25 @@ class Scripted:
     def close(self) -> None: ...
 
 
-NOISE = np.random.default_rng(0).normal(scale=4.0, size=(4, 20))
-CLEAR, CLOSE = np.full(20, 10.0) + NOISE[0], np.full(20, 10.0) + NOISE[1]
-
-
 @pytest.mark.parametrize(
     ("measured", "kept"),
     [
-        ([CLOSE, CLEAR], 16),
-        ([CLEAR, CLOSE], 16),
-        ([CLEAR, CLEAR], 16),
-        ([CLEAR, CLEAR - 0.5], 8),
-        ([CLEAR, CLEAR - 5.0 + NOISE[2]], 8),
-        ([CLEAR, CLEAR - 5.0 + NOISE[2], CLEAR + NOISE[3]], 24),
-        ([CLEAR - 5.0 + NOISE[2], CLEAR], 16),
+        ([[2.0, 4.0], [2.0, 3.9]], 8),
+        ([[2.0, 3.9], [2.0, 4.0]], 16),
+        ([[2.0, 4.0], [4.0, 2.0]], 16),
+        ([[2.0, 4.0], [5.0, 0.0], [3.0, 2.9], [1.0, 1.0]], 8),
+        ([[2.0, 4.0], [0.0, 0.0], [3.0, 3.5], [3.0, 3.0]], 24),
     ],
-    ids=["within noise", "within noise, reversed", "tie", "surely worse by little", "worse", "recovers", "improves"],
+    ids=["lower by little", "higher by little", "equal", "falls", "recovers"],
 )
-def test_the_latest_model_that_is_not_significantly_worse_is_kept(measured: list, kept: int, tmp_path: Path):
-    arena, path = Scripted(*(list(map(float, returns)) for returns in measured)), tmp_path / "best.zip"
-    make_ppo().learn(8 * len(measured), callback=SelectBest(arena, path, 20, every_steps=8))
+def test_the_model_with_the_highest_mean_is_kept(measured: list[list[float]], kept: int, tmp_path: Path):
+    arena, path = Scripted(*measured), tmp_path / "best.zip"
+    make_ppo().learn(8 * len(measured), callback=SelectBest(arena, path, 2, every_steps=8))
     assert arena.measurements == []
-    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 20)}
+    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 2)}
     note = read_note(path)
     assert note["steps"] == kept == PPO.load(path, device="cpu").num_timesteps
     assert note["selection_return"] == pytest.approx(np.mean(measured[kept // 8 - 1]))
-
-
-def test_small_losses_do_not_add_up(tmp_path: Path):
-    """Each model is a little worse than the one before; those that are significantly below the best are not kept."""
-    falling = [list(map(float, CLEAR - 0.35 * step + NOISE[step % 3 + 1] / 4)) for step in range(6)]
-    assert not any(significantly_worse(after, before) for before, after in pairwise(falling))
-    path = tmp_path / "best.zip"
-    make_ppo().learn(48, callback=SelectBest(Scripted(*falling), path, 20, every_steps=8))
-    kept = read_note(path)["steps"] // 8 - 1
-    assert kept < 5
-    assert not significantly_worse(falling[kept], falling[0])
-    assert all(significantly_worse(later, falling[0]) for later in falling[kept + 1 :])
 
 
 @pytest.mark.parametrize(("stored", "replaced"), [(-1.0, True), (100.0, False)], ids=["worse", "better"])
@@ -226,7 +206,7 @@ def test_the_best_result_of_an_earlier_start_counts(
     stored: float, replaced: bool, make_selection: Callable[[int], EgoArena], tmp_path: Path
 ):
     path = tmp_path / "best.zip"
-    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0, "highest_returns": [stored, stored + 1]})
+    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0})
     model = make_ppo()
     model.num_timesteps = 8
     model.learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8), reset_num_timesteps=False)
@@ -237,14 +217,9 @@ def test_a_training_that_begins_anew_does_not_compare_with_a_lost_one(
     make_selection: Callable[[int], EgoArena], tmp_path: Path
 ):
     path = tmp_path / "best.zip"
-    save_model(make_ppo(), path, {"selection_return": 100.0, "steps": 24, "highest_returns": [100.0, 101.0]})
+    save_model(make_ppo(), path, {"selection_return": 100.0, "steps": 24})
     make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
     assert read_note(path)["steps"] == 8
-
-
-def test_one_episode_decides_nothing():
-    assert not significantly_worse([0.0], [100.0])
-    assert significantly_worse([0.0, 1.0], [100.0, 100.0])
 
 
 def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], EgoArena], tmp_path: Path):

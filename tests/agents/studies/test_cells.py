@@ -185,3 +185,8 @@ def test_the_code_of_an_environment_of_ones_own_is_in_the_name(
 def test_only_uneven_measurements_have_another_name(cells: Callable[..., list[Cell]]):
     assert "selections" not in next(c for c in cells(steps="512", selections="2") if c.plan).content
     assert "selections" in next(c for c in cells(steps="512", selections="3") if c.plan).content
+
+
+def test_where_there_is_a_choice_its_rule_is_in_the_name(cells: Callable[..., list[Cell]]):
+    assert "kept" not in next(c for c in cells(steps="512", selections="1") if c.plan).content
+    assert next(c for c in cells(steps="512", selections="2") if c.plan).content["kept"] == "highest mean"
