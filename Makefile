@@ -26,7 +26,7 @@ help: ## list the targets
 	touch $@
 
 train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
-	.venv/bin/python train_policy.py --what-if --num-samples 6 --steps 3000 --num-envs 2 --selections 3 --resume --out $(RUN_DIR)
+	.venv/bin/python train_policy.py --what-if --num-samples 6 --steps 3000 --num-envs 2 --selections 3 --set gamma=0.85 --resume --out $(RUN_DIR)
 
 # Checks shapes and types of every call; without the checker at the end nothing is checked.
 SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
