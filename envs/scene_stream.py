@@ -1,6 +1,6 @@
 """Forecasts the scenes of parallel environments with one forecaster; each environment has its own history and noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, fields
 from typing import Any
@@ -16,7 +16,7 @@ from predictor.online import MAX_ROWS, Chosen, OnlineForecaster
 from predictor.scene import Forecast, SceneBatch
 from predictor.scene_checks import MOST_STEPS, chosen_envs
 from predictor.support.config_checks import check_at_least, check_at_most, check_types
-from predictor.support.errors import ProtocolError
+from predictor.support.errors import ProtocolError, UserError, short
 from predictor.support.memory import check_count
 from predictor.support.runtime import resolve_device
 
@@ -151,8 +151,20 @@ class SceneStream:
             self._noise.put(env, stream._noise[0])
 
     def seed(self, seed: int | Sequence[int | None]) -> None:
-        """Restarts the samples' noise: environment i from seed + i, or from entry i unless that is None."""
-        seeds = [seed + env for env in range(len(self._noise))] if isinstance(seed, int | np.integer) else seed
+        """Restarts the samples' noise: environment i from seed + i, or from entry i unless that is None.
+
+        Raises:
+            UserError: a seed that is no whole number from 0 on, or another number of seeds than of environments.
+        """
+        envs = len(self._noise)
+        if isinstance(seed, int | np.integer):
+            seeds: list[Any] = [seed + env for env in range(envs)]
+        else:
+            seeds = list(seed) if isinstance(seed, Iterable) else []
+        wrong = [own for own in seeds if own is not None and (not isinstance(own, int | np.integer) or own < 0)]
+        if wrong or len(seeds) != envs:
+            wanted = f"a whole number from 0 on, or a list of {envs} such numbers or None"
+            raise UserError(f"seed needs {wanted}, got {short(seed)}")
         for env, own in enumerate(seeds):
             if own is not None:
                 self._noise.restart(env, own)

@@ -149,7 +149,6 @@ class OnlineForecaster:
         self._memory = memory.select(torch.from_numpy(kept).to(self.device))
         self._ids = ids[kept]
 
-    @torch.inference_mode()
     def forecast(
         self,
         horizon_steps: int | None = None,
@@ -158,6 +157,8 @@ class OnlineForecaster:
         ego_plan: Float[np.ndarray, "..."] | None = None,
     ) -> Forecast:
         """Forecasts from the latest observation; sample 0 is the single forecast.
+
+        No gradient flows through a forecast; its tensors may be inputs of networks that are trained.
 
         Args:
             horizon_steps: number of steps; None takes the forecaster's.
@@ -173,6 +174,19 @@ class OnlineForecaster:
                 the ego is absent, or the plans are of another shape or not finite.
         """
         use_one_thread_after_fork()
+        with torch.inference_mode():
+            made = self._forecast(horizon_steps, num_samples, generator, ego_plan)
+        # tensors made in inference mode are refused by autograd and cannot be written to
+        own: Any = {f.name: None if (of := getattr(made, f.name)) is None else of.clone() for f in fields(Forecast)}
+        return Forecast(**own)
+
+    def _forecast(
+        self,
+        horizon_steps: int | None,
+        num_samples: int,
+        generator: Noise | None,
+        ego_plan: Float[np.ndarray, "..."] | None,
+    ) -> Forecast:
         if not self._beliefs:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         steps = self.forecaster.horizon_steps if horizon_steps is None else horizon_steps
@@ -287,15 +301,16 @@ class OnlineForecaster:
         self, scenes: SceneBatch, old_ids: Int[np.ndarray, "envs agents"], memory: Memory, agents: int
     ) -> "_Taken":
         """Observes scenes whose agents stand in the first `agents` columns."""
-        valid = scenes.valid[:, :agents]
-        ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
+        valid = scenes.valid[:, :agents].copy()  # the simulator may write its next step into its array
+        ids = np.where(scenes.valid, scenes.ids.astype(np.int64, copy=False), PADDING_ID)
         if agents < ids.shape[1] or not np.array_equal(old_ids, ids) or (ids[scenes.valid] < 0).any():
             check_ids(ids, scenes.valid)
             source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
-        # float64 until the ego's position is subtracted: a scene 10 km down the road loses no precision
         # values in padding, not-a-number for example, must not reach any agent
         local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
+        # float64 until the ego's position is subtracted: a scene 10 km down the road loses no precision
+        local = local.astype(np.float64, copy=False)
         check_states(local)
         axes = len(self._ego_axes)
         if self._ego_axes.any() and (valid.any(axis=1) & ~valid[:, 0]).any():

@@ -38,7 +38,7 @@ def find_own(name: str) -> Any:
         found = getattr(importlib.import_module(module), attribute, None)
     except (ImportError, ValueError) as error:
         raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {error}") from error
-    except Exception as error:  # whatever the module does
+    except (Exception, SystemExit) as error:  # whatever the module does
         raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {named(error)}") from error
     if found is None:
         raise UserError(f"module '{short(module)}' has no '{short(attribute)}' for forecaster '{short(name)}'")
@@ -62,7 +62,7 @@ def make_own(name: str, scene_spec: SceneSpec, source: str) -> Forecaster:
             found = found(scene_spec)
         except UserError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise UserError(
                 f"forecaster '{name}': calling it with a SceneSpec failed with {type(error).__name__}: {error}"
             ) from error
@@ -80,5 +80,5 @@ def _registered(name: str) -> Any:
         )
     try:
         return known[name].load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"forecaster '{name}' cannot be imported from {known[name].value}: {named(error)}") from error

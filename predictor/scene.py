@@ -170,7 +170,7 @@ class Scene:
         """Returns the scene behind `agents` absent ones, for a forecaster with an ego where no agent is the ego."""
         return Scene(
             np.pad(self.states, ((agents, 0), (0, 0))),
-            np.pad(self.ids, (agents, 0), constant_values=PADDING_ID),
+            np.pad(self.ids.astype(np.int64), (agents, 0), constant_values=PADDING_ID),
             np.pad(self.valid, (agents, 0)),
             self.heading_rad,
         )

@@ -11,11 +11,16 @@ from predictor.support.memory import check_memory
 
 MOST_STEPS = 100_000
 """Largest number of steps of a forecast."""
-_KINDS = {"states": ("f", "floating point"), "ids": ("iu", "integers"), "valid": ("b", "bool")}
+_KINDS = {
+    "states": ("f", "floating point"),
+    "ids": ("iu", "integers"),
+    "valid": ("b", "bool"),
+    "heading_rad": ("fiu", "numbers"),
+}
 
 
 def check_batch(scenes: SceneBatch, envs: int, agents: int, features: int) -> None:
-    """Checks types and shapes of a batch of scenes; no value is read.
+    """Checks types and shapes of a batch of scenes, and that its headings are finite; no other value is read.
 
     Args:
         scenes: batch.
@@ -31,9 +36,12 @@ def check_batch(scenes: SceneBatch, envs: int, agents: int, features: int) -> No
         if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
             got = f"{array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
             raise UserError(f"{name} of scenes must be a NumPy array of {wanted}, got {got}")
-        shape = (envs, agents, features) if name == "states" else (envs, agents)
+        shape = {"states": (envs, agents, features), "heading_rad": (envs,)}.get(name, (envs, agents))
         if array.shape != shape:
             raise UserError(f"{name} of {envs} scenes must have the shape {shape}, got {array.shape}")
+    if not np.isfinite(scenes.heading_rad).all():
+        scene = int(np.flatnonzero(~np.isfinite(scenes.heading_rad))[0])
+        raise UserError(f"heading_rad of scenes must be finite, got {scenes.heading_rad[scene]} (scene {scene})")
 
 
 def check_states(states: Float[np.ndarray, "envs agents state"]) -> None:

@@ -3,8 +3,8 @@
 Springs are linear in their constants: over a step, Δv_i = Σ_j k_ij ∫(r_j − r_i) dt. The integral follows from positions
 and velocities at both ends (Hermite, exact to fourth order in dt). Each receiver keeps its normal equations over
 senders, so streaming is exact; the two estimates of a spring are averaged. Steps in which the receiver may have touched
-a wall are left out; a sender that touches one bends the integral a little. Columns of the equations are agents, so
-agents must keep their places.
+a wall are left out; a sender that touches one bends the integral a little. Columns of the equations are the scene's
+places, so agents must keep theirs.
 """
 
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from predictor.data.springs import Physics, simulate
 from predictor.forecaster import Belief, Futures, Memory
@@ -78,7 +79,9 @@ class SpringLeastSquares:
         usable = (both.any(-1) & ~self._near_wall(before) & ~self._near_wall(now))[..., None, None]
         normal = torch.einsum("bija,bila->bijl", regressors, regressors)
         right = torch.einsum("bija,bia->bij", regressors, kick)
-        equations = equations + torch.cat([normal, right[..., None]], dim=-1) * usable
+        absent = equations.shape[-1] - 1 - states.shape[1]  # places behind the last agent, of which no state is given
+        added = torch.cat([functional.pad(normal, (0, absent)), right[..., None]], dim=-1)
+        equations = equations + added * usable
         constants = self._solve(equations, pair_mask(valid))
         has_edge = constants > self.smallest_constant / 2
         probs = torch.stack([~has_edge, has_edge], dim=-1).to(states.dtype)
@@ -109,5 +112,5 @@ class SpringLeastSquares:
     def _solve(self, equations: Tensor, pairs: Tensor) -> Float[Tensor, "batch agents agents"]:
         agents = equations.shape[2]
         normal = equations[..., :agents] + RIDGE * torch.eye(agents, dtype=torch.float64)
-        solved = torch.linalg.solve(normal, equations[..., agents])
+        solved = torch.linalg.solve(normal, equations[..., -1])
         return (solved + solved.transpose(1, 2)) / 2 * pairs

@@ -334,7 +334,8 @@ def _examples(
     horizon_steps: int,
 ) -> tuple[Float[Tensor, "examples features"], Float[Tensor, "examples horizon axes"]]:
     step, agent = who.T
-    positions = torch.from_numpy(episode.states[..., : spec.position_dim])
+    states = torch.from_numpy(np.array(episode.states, dtype=np.float32, order="C"))
+    positions = states[..., : spec.position_dim]
     future = positions[step[:, None] + np.arange(1, horizon_steps + 1), agent[:, None]]
-    features = query_features(spec, torch.from_numpy(episode.states), torch.from_numpy(seen))
+    features = query_features(spec, states, torch.from_numpy(np.array(seen, order="C")))
     return features[step, agent], future - positions[step, agent][:, None]

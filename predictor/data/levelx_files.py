@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.data.loading import bad_line, finite, read_lines, whole
+from predictor.data.loading import LARGEST_WHOLE, bad_line, finite, read_lines, whole
 from predictor.data.track_points import TrackPoints
 from predictor.scene import LARGEST
 from predictor.support.errors import UserError
@@ -180,6 +180,8 @@ def _read_tracks_meta(path: Path, layout: Layout) -> dict[int, TrackInfo]:
             raise bad_line(path, line, f"class must be one of {', '.join(CLASSES)}, got '{values['class']}'")
         direction = whole(values["drivingDirection"], "drivingDirection", path, line) if extra else 0
         track = whole(values[_ID[layout]], _ID[layout], path, line)
+        if track in info:
+            raise bad_line(path, line, f"{_ID[layout]} {track} is there already")
         info[track] = TrackInfo(CLASSES[kind], direction == _LEFT_DIRECTION)
     return info
 
@@ -259,9 +261,9 @@ def _line_of(path: Path, place: int) -> int:
 def _whole_column(path: Path, column: Float[np.ndarray, " lines"], name: str) -> Int[np.ndarray, " lines"]:
     with np.errstate(invalid="ignore"):  # too large for an integer: caught as not whole
         numbers = column.astype(np.int64)
-    wrong = np.flatnonzero((numbers != column) | (numbers < 0))
+    wrong = np.flatnonzero((numbers != column) | (numbers < 0) | (numbers > LARGEST_WHOLE))
     if len(wrong):
-        value = f"{name} must be a whole number from 0 up, got {column[wrong[0]]:g}"
+        value = f"{name} must be a whole number from 0 up, of at most 15 digits, got {column[wrong[0]]:g}"
         raise bad_line(path, _line_of(path, int(wrong[0])), value)
     return numbers
 

@@ -200,8 +200,8 @@ def _moments(path: Path) -> Iterator[tuple[str, Any]]:
 def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
     """Returns time [ms], quarter, and positions [ft] by team and player."""
     try:
-        quarter, time_ms, points = int(moment[0]), int(moment[1]), moment[5]
-        entities = {(int(point[0]), int(point[1])): (float(point[2]), float(point[3])) for point in points}
+        quarter, time_ms, points = _whole(moment[0]), _whole(moment[1]), moment[5]
+        entities = {(_whole(point[0]), _whole(point[1])): (float(point[2]), float(point[3])) for point in points}
     except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
         raise UserError(
             f"{path}, {where}: expected [quarter, ms, clock, shot clock, null, [[team, player, x, y, z], …]], "
@@ -214,7 +214,17 @@ def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
         )
     if any(not BALL_ID < player <= LARGEST_WHOLE for team, player in entities if team != -1):
         raise UserError(f"{path}, {where}: ids of players must be positive, of at most 15 digits; get the file anew")
+    players = [player for team, player in entities if team != -1]
+    if len(set(players)) < len(players):
+        raise UserError(f"{path}, {where}: a player is in both teams; get the file anew")
     return time_ms, quarter, entities
+
+
+def _whole(value: Any) -> int:
+    number = int(value)
+    if number != float(value):
+        raise ValueError(value)
+    return number
 
 
 def _uninterrupted(moments: dict[int, tuple[int, Entities]]) -> Iterator[list[int]]:

@@ -104,7 +104,7 @@ def read_scales(path: Path) -> dict[str, float]:
     scene, video = "", ""
     for number, text in enumerate(read_lines(path), start=1):
         content = text.split("#")[0].rstrip()
-        if not content:
+        if not content or content == "---":  # YAML's mark of a beginning
             continue
         name, colon, value = (part.strip() for part in content.strip().partition(":"))
         if not colon or not name:
@@ -121,6 +121,8 @@ def read_scales(path: Path) -> dict[str, float]:
             if not 0 < scale <= LARGEST_SCALE:
                 least = f"at most {LARGEST_SCALE:g}" if scale > 0 else "positive"
                 raise bad_line(path, number, f"scale must be {least}, got {scale:g}")
+            if f"{scene}/{video}" in scales:
+                raise bad_line(path, number, f"{scene}/{video} has a scale already")
             scales[f"{scene}/{video}"] = scale
     return scales
 

@@ -68,9 +68,12 @@ def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Co
     first, last = (int(points.steps.min()), int(points.steps.max())) if len(points) else (0, -1)
     if last - first >= MOST_STEPS:
         raise UserError(f"{label}: frames span {last - first + 1:,} steps, at most {MOST_STEPS:,}; a frame is wrong")
+    order = np.argsort(points.steps, kind="stable")
+    ordered = TrackPoints(points.steps[order], points.tracks[order], points.states[order])
     for begin in range(first, last + 1, episode_steps):
         length = min(episode_steps, last + 1 - begin)
-        inside = points.where((points.steps >= begin) & (points.steps < begin + length))
+        start, end = np.searchsorted(ordered.steps, (begin, begin + length)).tolist()
+        inside = TrackPoints(ordered.steps[start:end], ordered.tracks[start:end], ordered.states[start:end])
         if not len(inside):
             counts["episodes left out: no agent"] += 1
         elif length < 2:

@@ -56,6 +56,16 @@ def test_environments_draw_different_noise():
         assert np.abs(samples[one, :, 1:] - samples[other, :, 1:]).max() > 1e-2
 
 
+@pytest.mark.parametrize("seed", [-1, 1.5, None, [1, 2], [1, 2, 3, 4], [1.5, 2, 3], [1, -2, 3]])
+def test_seeds_are_whole_numbers_one_for_each_environment(seed: Any):
+    made, untouched = stream(), stream()
+    with pytest.raises(
+        UserError, match=r"seed needs a whole number from 0 on, or a list of 3 such numbers or None, got"
+    ):
+        made.seed(seed)
+    assert_same(made.observe(scenes(0)), untouched.observe(scenes(0)))
+
+
 def test_a_seed_restarts_the_noise_of_its_environment_only():
     made, untouched = stream(), stream()
     for each in (made, untouched):

@@ -5,6 +5,7 @@ agent has its own column, and encodes it in one call.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -183,6 +184,78 @@ def differ(one: Forecast, other: Forecast, env: int = 0) -> float:
 def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
     with pytest.raises(ProtocolError, match=r"forecast\(\) needs an observation; call observe\(\) first"):
         online(forecaster).forecast()
+
+
+@pytest.mark.parametrize("num_samples", [1, 3])
+def test_a_network_that_is_trained_may_read_forecasts(forecaster: DGVAE, num_samples: int):
+    stream = online(forecaster)
+    stream.observe(batch(scene(states_of(0, 0, 3), AGENTS)))
+    forecast = stream.forecast(num_samples=num_samples)
+    network = torch.nn.Linear(2, 1)
+    network(forecast.xy).sum().backward()
+    assert network.weight.grad is not None and network.weight.grad.abs().sum() > 0
+    for field in fields(Forecast):
+        if (value := getattr(forecast, field.name)) is not None:
+            value.zero_()  # in place, which tensors of inference mode refuse
+    again = stream.forecast(num_samples=num_samples)
+    assert again.xy.abs().sum() > 0 and not again.xy.requires_grad
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint32, np.uint64, np.int32])
+def test_ids_of_any_width_follow_agents(forecaster: DGVAE, kind: Any):
+    """One observation of one environment has ids beyond the width of the first."""
+    plain, narrow = online(forecaster, 2), online(forecaster, 2)
+    for seed in range(2):
+        now = batch(scene(states_of(seed, 0, 3), AGENTS), scene(states_of(seed + 5, 0, 7), AGENTS))
+        plain.observe(now)
+        narrow.observe(replace(now, ids=np.where(now.valid, now.ids, 0).astype(kind)))
+    far = batch(scene({**states_of(3, 0), 2**32 + 7: states_of(4, 0)[0]}, AGENTS))
+    for stream in (plain, narrow):
+        stream.observe(far, np.array([1]))
+        assert stream._ids[1].max() == 2**32 + 7
+    assert_same(narrow.forecast(), plain.forecast())
+
+
+def test_what_is_written_into_a_scene_later_reaches_nothing(forecaster: DGVAE):
+    now, stream = batch(scene(states_of(0, *range(AGENTS)), AGENTS)), online(forecaster)
+    stream.observe(now)
+    before = stream.forecast()
+    for array in (now.states, now.ids, now.valid):
+        array[:] = 0
+    assert_same(stream.forecast(), before)
+
+
+def test_arrays_may_be_mirrored_or_read_only(forecaster: DGVAE):
+    now, stream, other = batch(scene(states_of(0, *range(AGENTS)), AGENTS)), online(forecaster), online(forecaster)
+    other.observe(now)
+    mirrored = {f.name: np.ascontiguousarray(getattr(now, f.name)[::-1])[::-1] for f in fields(now)}
+    for array in mirrored.values():
+        array.flags.writeable = False
+    stream.observe(SceneBatch(**mirrored))
+    assert_same(stream.forecast(), other.forecast())
+
+
+@pytest.mark.parametrize(
+    ("heading_rad", "message"),
+    [
+        (np.array([np.nan]), r"heading_rad of scenes must be finite, got nan \(scene 0\)"),
+        (np.zeros((1, 1)), r"heading_rad of 1 scenes must have the shape \(1,\), got \(1, 1\)"),
+        (np.array(["north"]), "heading_rad of scenes must be a NumPy array of numbers, got <U5"),
+        (None, "heading_rad of scenes must be a NumPy array of numbers, got NoneType"),
+    ],
+)
+def test_headings_that_are_none_are_refused(forecaster: DGVAE, heading_rad: Any, message: str):
+    now = replace(batch(scene(states_of(0, 0, 3), AGENTS)), heading_rad=heading_rad)
+    with pytest.raises(UserError, match=message):
+        online(forecaster).observe(now)
+
+
+def test_a_state_that_is_infinite_in_half_precision_is_refused(forecaster: DGVAE):
+    now = batch(scene(states_of(0, 0, 3), AGENTS))
+    now = replace(now, states=now.states.astype(np.float16))
+    now.states[0, 1, 0] = np.inf
+    with pytest.raises(UserError, match="states must be finite"):
+        online(forecaster).observe(now)
 
 
 def test_a_forecaster_that_gives_something_else_is_named_in_a_line():

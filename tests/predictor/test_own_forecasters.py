@@ -75,6 +75,19 @@ def test_what_makes_no_forecaster_is_named_in_a_line(name: str, sentence: str):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "code", ["import sys; sys.exit(3)", "import sys\nclass Mine:\n    def __init__(self, spec): sys.exit(3)"]
+)
+def test_a_module_that_would_end_the_process_is_named_in_a_line(
+    code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "ending.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "ending", raising=False)
+    with pytest.raises(UserError, match="ending.*SystemExit: 3"):
+        load_forecaster("own:ending:Mine", SPEC, "env 'a'")
+
+
 def test_it_has_no_weights():
     with pytest.raises(UserError, match="is a forecaster of your own and no checkpoint"):
         resolve(f"{NAME}Mine")

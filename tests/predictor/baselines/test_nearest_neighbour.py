@@ -429,6 +429,18 @@ def test_an_episode_without_anyone_does_not_matter():
     assert torch.equal(collect_examples(with_gaps, layout, HORIZON).features, expected.features)
 
 
+def test_arrays_may_lie_in_memory_as_they_will():
+    layout, plain = spec(), circling_episode(0)
+    expected = collect_examples([plain], layout, HORIZON)
+    mirrored = replace(
+        plain,
+        states=np.ascontiguousarray(plain.states[:, ::-1])[:, ::-1],
+        valid=np.ascontiguousarray(plain.valid[::-1])[::-1],
+    )
+    for episodes in ([mirrored], [replace(plain, states=plain.states.astype(">f4"))]):
+        assert torch.equal(collect_examples(episodes, layout, HORIZON).features, expected.features)
+
+
 # --- Which agents are there, and where --------------------------------------------------------------------------------
 
 

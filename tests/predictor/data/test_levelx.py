@@ -187,16 +187,27 @@ def test_acceleration_across_points_to_the_left_of_the_heading(tmp_path: Path, l
 
 # --- Refusals ---------------------------------------------------------------------------------------------------------
 
+WHOLE = "must be a whole number from 0 up, of at most 15 digits"
 TRACK_ERRORS = {
     "nan": (centre(1, 1).replace(",1,-1,", ",nan,-1,"), "xCenter must be a finite number, got 'nan'"),
     "empty": (centre(1, 1).replace(",1,-1,", ",,-1,"), "xCenter must be a finite number, got ''"),
     "text": (centre(1, 1).replace("-0.25", "left"), "latAcceleration must be a finite number, got 'left'"),
     "short": ("0,1,1,1,2,3", "expected 17 columns, got 6"),
-    "frame": (centre(1, 1).replace("0,1,1,", "0,1,1.5,", 1), "frame must be a whole number from 0 up, got 1.5"),
-    "track": (centre(1, 1).replace("0,1,1,", "0,-2,1,", 1), "trackId must be a whole number from 0 up, got -2"),
+    "frame": (
+        centre(1, 1).replace("0,1,1,", "0,1,1.5,", 1),
+        f"frame {WHOLE}, got 1.5",
+    ),
+    "track": (
+        centre(1, 1).replace("0,1,1,", "0,-2,1,", 1),
+        f"trackId {WHOLE}, got -2",
+    ),
     "huge": (
         centre(1, 1).replace("0,1,1,", "0,1e30,1,", 1),
-        "trackId must be a whole number from 0 up, got 1e+30",
+        f"trackId {WHOLE}, got 1e+30",
+    ),
+    "long": (
+        centre(1, 1).replace("0,1,1,", f"0,{2**53},1,", 1),
+        f"trackId {WHOLE}, got 9.0072e+15",
     ),
     "twice": (centre(1, 0), "track 1 has frame 0 in line 2 already"),
     "unknown track": (centre(6, 5), "track 6 is not in 00_tracksMeta.csv"),
@@ -235,6 +246,7 @@ META_ERRORS = {
     "class": ("00_tracksMeta.csv", 3, "0,3,10,40,31,2,4,tank", 3, "class must be one of car, van, truck, bus,"),
     "no class": ("00_tracksMeta.csv", 1, CENTRE_META.replace("class", "kind"), 1, "column class is missing"),
     "track": ("00_tracksMeta.csv", 3, "0,x,10,40,31,2,4,car", 3, "trackId must be a whole number, got 'x'"),
+    "twice": ("00_tracksMeta.csv", 3, "0,1,10,40,31,2,4,car", 3, "trackId 1 is there already"),
     "short": ("00_tracksMeta.csv", 3, "0,3", 3, "the line has too few columns"),
     "rate": ("00_recordingMeta.csv", 2, "0,3,0,1,monday", 2, "frameRate must be positive, got 0"),
     "rate nan": ("00_recordingMeta.csv", 2, "0,3,nan,1,monday", 2, "frameRate must be a finite number, got 'nan'"),

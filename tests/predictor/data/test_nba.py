@@ -260,6 +260,11 @@ SPORTVU_ERRORS = {
     "null": (broken_moment(set_to(2, 2, None)), ", events[0].moments[1]: expected [quarter, ms, clock,"),
     "short point": (broken_moment(lambda m: m[5][3].__delitem__(slice(2, 5))), ", events[0].moments[1]: expected ["),
     "no points": (broken_moment(lambda m: m.pop()), ", events[0].moments[1]: expected [quarter, ms, clock,"),
+    "half an id": (broken_moment(set_to(2, 1, 100.5)), ", events[0].moments[1]: expected [quarter, ms, clock,"),
+    "both teams": (
+        broken_moment(lambda m: m[5].append([2, *m[5][1][1:]])),
+        ", events[0].moments[1]: a player is in both teams",
+    ),
     "id": (broken_moment(set_to(2, 1, 0)), ", events[0].moments[1]: ids of players must be positive"),
 }
 

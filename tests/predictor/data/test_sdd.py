@@ -174,6 +174,7 @@ SCALE_ERRORS = {
     "no colon": (3, "      scale 0.5", 3, "expected 'name:' or 'name: number', got 'scale 0.5'"),
     "no video": (2, "", 3, "'scale' belongs to no video"),
     "no scene": (1, "", 3, "'scale' belongs to no video"),
+    "twice": (3, "    scale: 0.5\n    scale: 0.6", 4, "quad/video0 has a scale already"),
 }
 
 
@@ -187,7 +188,7 @@ def test_broken_scales_are_one_line(case: str, dataset: Path, loader: Loader):
 
 def test_scales(tmp_path: Path):
     path = tmp_path / "scales.yaml"
-    path.write_text(SCALES)
+    path.write_text("---\n" + SCALES)
     assert read_scales(path) == {"quad/video0": 0.5, "quad/video1": 0.25}
     path.write_text("quad:\n  video0:\n    scale: 1\ngates:\n  scale: 2\n")
     with pytest.raises(UserError, match=r"line 5: 'scale' belongs to no video"):

@@ -54,6 +54,18 @@ def test_episodes_tile_a_recording():
     assert counts == {"episodes left out: no agent": 1}
 
 
+def test_the_order_of_points_does_not_matter():
+    rng = np.random.default_rng(0)
+    present = np.argwhere(rng.random((40, 6)) < 0.5)
+    given = TrackPoints(present[:, 0] - 9, present[:, 1], rng.normal(size=(len(present), 2)))
+    order = rng.permutation(len(given))
+    shuffled = TrackPoints(given.steps[order], given.tracks[order], given.states[order])
+    pairs = zip(*(cut_episodes(each, 7, "here", Counter()) for each in (given, shuffled)), strict=True)
+    for one, other in pairs:
+        for name in ("states", "valid", "ids"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 @pytest.mark.parametrize("steps", [3, 4, 5])
 def test_every_point_is_in_one_episode(steps: int):
     rng = np.random.default_rng(steps)
