@@ -22,6 +22,7 @@ from agents.vec_envs import (
     own_observations,
 )
 from envs.drivers.all_agents import has_heuristic, make_driver
+from envs.parallel import living
 from envs.readers.base import role_of
 from envs.sb3.acting import ActingPolicy, space_as_stored
 from envs.sb3.agents_as_rows import ParallelVecEnv
@@ -228,12 +229,14 @@ class MultiagentArena:
         observations, _ = env.reset(seed=seed)
         driver = make_driver(name, env, driver_rng(seed, group=1))  # group 0: agents that do not learn
         returns = dict.fromkeys(self._learners, 0.0)
-        steps, lived = 0, set(env.agents)
-        while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
+        steps, left = 0, list(env.agents)
+        lived = set(left)
+        while left and not (lived.issuperset(returns) and returns.keys().isdisjoint(left)):
             own = own_observations(observations)
             actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
-            observations, rewards, *_ = env.step(env.drive_others(own) | actions)
-            lived.update(env.agents)
+            observations, rewards, terminated, truncated, _ = env.step(env.drive_others(own) | actions)
+            left = living(env, terminated, truncated)
+            lived.update(left)
             for agent in returns:
                 returns[agent] += float(rewards.get(agent, 0.0))
             steps += 1

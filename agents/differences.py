@@ -3,13 +3,12 @@
 Seeds differ more than policies do, so the interval of a paired difference is smaller than those of the means suggest.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from agents.vec_envs import EpisodeResult
-from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, central_interval
+from predictor.evaluation.standard_errors import Estimate, bootstrap_sums, central_interval
 
 DRAWS = 10_000
 """Number of bootstrap draws of episodes."""
@@ -43,13 +42,12 @@ def return_differences(
     """
     subtracted = {e.seed: e.episode_return for e in results[reference]}
     found: dict[str, Estimate] = {}
-    drawn = functools.cache(lambda count: bootstrap_draws(count, seed, DRAWS))  # most policies have as many episodes
     for name, episodes in results.items():
         pairs = np.array([e.episode_return - subtracted[e.seed] for e in episodes if e.seed in subtracted])
         if name == reference or not len(pairs):
             continue
-        interval = central_interval(drawn(len(pairs)) @ pairs / len(pairs)) if len(pairs) > 1 else None
-        found[name] = Estimate(float(pairs.mean()), interval)
+        means = bootstrap_sums(pairs[:, None], seed, DRAWS)[:, 0] / len(pairs) if len(pairs) > 1 else None
+        found[name] = Estimate(float(pairs.mean()), None if means is None else central_interval(means))
     return found
 
 

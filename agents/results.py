@@ -60,9 +60,9 @@ class Evaluation:
     def summaries(self) -> list[PolicySummary]:
         """Summaries, one per policy."""
         played = [e for episodes in self.results.values() for e in episodes]
-        safe, failed = (
-            reports_only_events(said) for said in ([e.crashed for e in played], [e.success for e in played])
-        )
+        # a success with a crash counts as none, so it does not show that failures are reported
+        succeeded = [e.success for e in played if not e.crashed]
+        safe, failed = (reports_only_events(said) for said in ([e.crashed for e in played], succeeded))
         return [summarize(policy, episodes, safe, failed) for policy, episodes in self.results.items()]
 
     @property

@@ -16,6 +16,7 @@ from agents.hub import local_policy
 from agents.policy import load_policy, require_as_trained, task_of_policy
 from agents.runs import SHIPPED, policy_zip
 from agents.task import EVALUATION_SEED
+from envs.parallel import living
 from envs.sb3 import policy_file
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
@@ -120,7 +121,7 @@ def _play_in_own_window(config: WatchConfig, path: Path) -> int:
         began = time.monotonic()
         observation, rewards, terminated, truncated, _ = env.step(policy(observation))
         steps += 1
-        ended = not env.agents if isinstance(rewards, dict) else bool(terminated or truncated)
+        ended = not living(env, terminated, truncated) if isinstance(rewards, dict) else bool(terminated or truncated)
         time.sleep(max(0.0, pace_s - (time.monotonic() - began)))
     env.close()
     return steps

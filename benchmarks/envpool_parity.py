@@ -18,6 +18,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from rich.console import Console
 from rich.table import Table
 
+from agents.summaries import mean_and_standard_error
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import sees_forecasts
 from envs.readers import reader_for
@@ -276,10 +277,10 @@ def episodes_table(task_id: str, driver: str, both: Sequence[tuple[str, Episodes
     for heading in heads:
         table.add_column(heading, justify="left" if heading == "simulator" else "right")
     for name, seen in both:
-        error = np.sqrt(len(seen.returns))
-        cells = [(seen.returns, error), (seen.crashed, error)]
-        cells += [(v, 1.0) for v in (seen.lengths, seen.vehicles, seen.near, seen.nearest_m, seen.speed_mps)]
-        numbers = [f"{np.mean(v):.2f} ± {np.std(v) / scale:.2f}" for v, scale in cells]
+        cells = [mean_and_standard_error(list(map(float, v))) for v in (seen.returns, seen.crashed)]
+        spread = (seen.lengths, seen.vehicles, seen.near, seen.nearest_m, seen.speed_mps)
+        cells += [(float(np.mean(v)), float(np.std(v))) for v in spread]
+        numbers = [f"{mean:.2f} ± {around:.2f}" for mean, around in cells]
         table.add_row(name, *numbers, str(seen.starts))
     return table
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from envs.arms import Arm, EntryBank
 from envs.own_observation import ADDED_KEYS
-from envs.parallel import ForecastParallelEnv
+from envs.parallel import ForecastParallelEnv, living
 from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation
 from predictor.support.errors import UserError
@@ -54,8 +54,9 @@ def record_bank(env: Wrapper, source: str, episodes: int = EPISODES) -> EntryBan
 def _random_step(env: Wrapper, rng: np.random.Generator) -> tuple[Any, bool]:
     """Steps with random actions; returns the observations and whether the episode is over."""
     if isinstance(env, ForecastParallelEnv):
-        observations, *_ = env.step({agent: _drawn(env.action_space(agent), rng) for agent in env.agents})
-        return observations, not env.agents
+        actions = {agent: _drawn(env.action_space(agent), rng) for agent in env.agents}
+        observations, _, ended, cut, _ = env.step(actions)
+        return observations, not living(env, ended, cut)
     observation, _, terminated, truncated, _ = env.step(_drawn(env.action_space, rng))
     return observation, bool(terminated or truncated)
 

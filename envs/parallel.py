@@ -38,6 +38,11 @@ from predictor.scene import Forecast, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
 
 
+def living(env: ParallelEnv, terminated: Mapping[str, Any], truncated: Mapping[str, Any]) -> list[str]:
+    """Returns the agents that are left after a step, also where the environment keeps those that ended in `agents`."""
+    return [agent for agent in env.agents if not (terminated.get(agent) or truncated.get(agent))]
+
+
 class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     """Adds forecasts of the other agents to each agent's observation.
 

@@ -22,7 +22,7 @@ from envs.drivers.trained import (
     wrapper_options,
 )
 from envs.own_observation import without_added
-from envs.parallel import ForecastParallelEnv
+from envs.parallel import ForecastParallelEnv, living
 from envs.readers import multiagent_env_id, outcome_keys
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
@@ -260,8 +260,8 @@ class MultiagentWorld:
             seen = aside.whole
         self._place.move()
         with named(self._id, self._place):
-            self._observations, *_ = self.env.step(self._driver(seen))
-        return not self.env.agents
+            self._observations, _, terminated, truncated, _ = self.env.step(self._driver(seen))
+        return not living(self.env, terminated, truncated)
 
     def generators(self) -> list[np.random.Generator]:
         """Random streams of simulator and drivers; agents have streams of their own beside them."""

@@ -13,6 +13,7 @@ forecasts wrap the copies in `ForecastParallelEnv`: they then share one batched 
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from envs.batched_forward import collected
-from envs.parallel import batch_forwards
+from envs.parallel import batch_forwards, living
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from envs.seeding import driver_rng
 from predictor.support.errors import ProtocolError, UserError
@@ -131,9 +132,15 @@ class ParallelVecEnv(VecEnv):
         """Seeds copy i with seed + i, or seed[i], at the next reset; later episodes go on from its own generator.
 
         Until it is called, the sampled futures of all copies have equal noise.
+
+        Raises:
+            UserError: another number of seeds than of copies.
         """
-        first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-        self._seeds = [first[copy] if isinstance(first, Sequence) else first + copy for copy in self.copies_of_envs]
+        given = np.asarray(np.random.default_rng().integers(2**31) if seed is None else seed)
+        own = given if given.ndim else given + np.arange(len(self._copies))
+        if len(own) != len(self._copies):
+            raise UserError(f"seed needs a number, or one for each of {len(self._copies)} copies, got {len(own)}")
+        self._seeds = [int(own[copy]) for copy in self.copies_of_envs]
         return self._seeds
 
     def reset(self) -> VecEnvObs:
@@ -305,7 +312,7 @@ class _Copy:
         before = self.living or {}
         others = {agent: seen for agent, seen in before.items() if agent not in self.learners}
         observations, rewards, terminated, truncated, infos = self.env.step({**actions, **self._act_for(others)})
-        self._enter([a for a in self.env.agents if not (terminated.get(a) or truncated.get(a))], observations)
+        self._enter(living(self.env, terminated, truncated), observations)
         turns = []
         for agent in self.learners:
             lives = self.lives(agent)
@@ -315,18 +322,16 @@ class _Copy:
             turn = _Turn(True, float(rewards.get(agent, 0.0)), not lives, info=dict(infos.get(agent, {})))
             if turn.done:
                 turn.truncated = not terminated.get(agent, False)
-                turn.closing = observations.get(agent, before[agent])
+                turn.closing = deepcopy(observations.get(agent, before[agent]))  # a reset may write into its arrays
             turns.append(turn)
         return turns
 
     def _enter(self, agents: Iterable[str], observations: Mapping[str, Any]) -> None:
         """Sets the living agents and their observations."""
         names = list(agents)
-        unknown = [agent for agent in names if agent not in self.env.possible_agents]
-        if unknown:
+        if unknown := [agent for agent in names if agent not in self.env.possible_agents]:
             raise UserError(f"every agent must be one of possible_agents, but {unknown} are not; add them there")
-        blind = [agent for agent in names if agent not in observations]
-        if blind:
+        if blind := [agent for agent in names if agent not in observations]:
             raise UserError(f"every living agent needs an observation, the environment gave none for {blind}")
         self.living = {agent: observations[agent] for agent in names}
         self._lived.update(names)
@@ -335,8 +340,7 @@ class _Copy:
         if not others or self.partner is None:
             return {}
         chosen = self.partner(self.env, others, self._generator)
-        missing = [agent for agent in others if agent not in chosen]
-        if missing:
+        if missing := [agent for agent in others if agent not in chosen]:
             raise UserError(f"partner must act for {list(others)}, but gave no action for {missing}")
         return {agent: chosen[agent] for agent in others}
 

@@ -11,7 +11,16 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from envs.observation import batch_entries, scene_spaces
 from envs.readers.envpool import PoolReader, envpool_spec
-from envs.simulators.envpool import ENV_IDS, MAX_SEED, info_of, is_terminated, make_pool, meta_actions_of
+from envs.simulators.envpool import (
+    ENV_IDS,
+    MAX_SEED,
+    check_rewards,
+    checked_actions,
+    info_of,
+    is_terminated,
+    make_pool,
+    meta_actions_of,
+)
 from predictor.scene import SceneSpec
 from predictor.support.errors import ProtocolError, UserError
 
@@ -89,22 +98,22 @@ class EnvPoolVecEnv(VecEnv):
         """Keeps the actions of the next step.
 
         Raises:
-            UserError: not one action per env.
+            UserError: see `checked_actions`.
         """
-        if len(actions) != self.num_envs:
-            raise UserError(f"a step needs one action for each of {self.num_envs} envs, got {len(actions)}")
-        self._actions = np.asarray(actions)
+        self._actions = checked_actions(self.action_space, actions, self.num_envs)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Steps all envs; those whose episode ended begin the next one.
 
         Raises:
             ProtocolError: before the first reset, or without actions.
+            UserError: rewards that are not finite.
         """
         if not self._running or self._actions is None:
             raise ProtocolError("there is nothing to step; call reset() and step_async(actions) first")
         own, rewards, terminated, truncated, info = self._pool.step(self._actions)
         self._actions = None
+        check_rewards(self.task_id, rewards)
         observations = self._observe(own, np.arange(self.num_envs))
         over = is_terminated(terminated, truncated, info["crashed"])
         dones, cut = over | truncated, truncated & ~over

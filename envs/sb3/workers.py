@@ -12,11 +12,13 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
 from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, reason_of, share
+from predictor.support.errors import UserError
 from predictor.support.processes import end, follow_parent, how_it_ended, start
 
 CLOSE_S = 5.0
@@ -60,6 +62,26 @@ class WorkerVecEnv(SubprocVecEnv):
             self.close()
             raise
         VecEnv.__init__(self, len(env_fns), observation_space, action_space)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Sends each process its action.
+
+        Raises:
+            UserError: not one action for each environment; nothing is sent then.
+        """
+        if len(actions) != self.num_envs:
+            raise UserError(f"a step needs one action for each of {self.num_envs} envs, got {len(actions)}")
+        super().step_async(actions)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Returns an attribute of environments.
+
+        Raises:
+            AttributeError: one of all environments does not have it; the processes go on.
+        """
+        if not self.has_attr(attr_name):
+            raise AttributeError(f"the environments have no attribute '{attr_name}'")
+        return super().get_attr(attr_name, indices)
 
     def close(self) -> None:
         """Ends the processes; those whose environments are in order close them first."""

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from predictor.support.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError, short
 
 HIGHWAY_ENV_OF: dict[str, str] = {
     "Highway-v0": "highway-v0",
@@ -113,8 +113,10 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
         settings: settings of the task (`duration`, `policy_frequency`, … ; docs/envpool.md), or `render_mode`.
 
     Raises:
-        UserError: no EnvPool, an unknown task or setting.
+        UserError: no EnvPool, an unknown task or setting, a value that a setting cannot have, or fewer than 0 threads.
     """
+    if num_threads < 0:
+        raise UserError(f"num_threads must be at least 0, got {num_threads}")
     if task_id not in HIGHWAY_ENV_OF:
         raise UserError(f"no EnvPool task '{task_id}' is known here; known: {', '.join(known_tasks())}")
     try:
@@ -130,19 +132,51 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
     known = [k for k in envpool.make_spec(task_id).config._fields if k not in _OWN_SETTINGS]
     if unknown := set(settings) - {*known, "render_mode"}:
         raise UserError(f"EnvPool's {task_id} has no setting {sorted(unknown)}; it has {', '.join(known)}")
-    pool = envpool.make(
-        task_id,
-        env_type="gymnasium",
-        num_envs=len(seeds),
-        seed=[seed % MAX_SEED for seed in seeds],
-        num_threads=num_threads,
-        **settings,
-    )
+    try:
+        pool = envpool.make(
+            task_id,
+            env_type="gymnasium",
+            num_envs=len(seeds),
+            seed=[seed % MAX_SEED for seed in seeds],
+            num_threads=num_threads,
+            **settings,
+        )
+    except (TypeError, ValueError) as error:
+        said = "their types do not fit" if isinstance(error, TypeError) else short(error, 120)
+        raise UserError(f"EnvPool's {task_id} does not take the settings {short(settings)}: {said}") from error
     if not hasattr(pool, "debug_states"):
         raise UserError(
             f"EnvPool {envpool.__version__} does not report the vehicles' positions; install 1.2.5 or later"
         )
     return pool
+
+
+def checked_actions(space: gym.Space, actions: Any, num_envs: int) -> NDArray[Any]:
+    """Returns one action for each environment in the type of the space; EnvPool itself ends the process at some others.
+
+    Raises:
+        UserError: another shape, numbers that are not finite, or a discrete action that does not exist.
+    """
+    given = np.asarray(actions)
+    shape = (num_envs, *(space.shape or ()))
+    if given.shape != shape:
+        raise UserError(f"a step needs one action for each of {num_envs} envs, of shape {shape}, got {given.shape}")
+    if isinstance(space, gym.spaces.Discrete):
+        if given.dtype.kind not in "iu" or ((given < 0) | (given >= space.n)).any():
+            raise UserError(f"an action must be a whole number in 0…{space.n - 1}, got {short(given.tolist())}")
+    elif given.dtype.kind not in "fiu" or not np.isfinite(given).all():
+        raise UserError(f"actions must be finite numbers, got {short(given.tolist())}")
+    return given.astype(space.dtype)
+
+
+def check_rewards(task_id: str, rewards: NDArray[Any]) -> None:
+    """Checks that rewards are finite; EnvPool gives others for some states.
+
+    Raises:
+        UserError: they are not.
+    """
+    if not np.isfinite(rewards).all():
+        raise UserError(f"EnvPool's {task_id} gave rewards that are not finite: {short(rewards.tolist())}")
 
 
 def is_terminated(
@@ -210,16 +244,13 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
 
         Raises:
             ProtocolError: before a reset or after the episode's end, where EnvPool would silently begin another.
-            UserError: a discrete action that does not exist.
+            UserError: see `checked_actions` and `check_rewards`.
         """
         if not self._running:
             raise ProtocolError("the episode has not begun or is over; call reset() first")
-        space = self.action_space
-        if isinstance(space, gym.spaces.Discrete) and not 0 <= int(action) < space.n:
-            raise UserError(f"action must be in 0…{space.n - 1}, got {action}")
-        observations, rewards, terminated, truncated, info = self._pool.step(
-            np.asarray(action, dtype=space.dtype)[None]
-        )
+        actions = checked_actions(self.action_space, np.asarray(action)[None], 1)
+        observations, rewards, terminated, truncated, info = self._pool.step(actions)
+        check_rewards(self.task_id, rewards)
         over = bool(is_terminated(terminated, truncated, info["crashed"])[0])
         self._running = not (over or truncated[0])
         return observations[0], float(rewards[0]), over, bool(truncated[0]), info_of(info, 0)

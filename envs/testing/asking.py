@@ -75,6 +75,8 @@ def asked_step(env: Any, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         for name, value in zip(names[2:4], found[2:4], strict=True):
             if np.size(value) != 1:
                 raise ReaderProblem(f"step: {name} must be True or False, got {short(repr(value), 60)}")
+    elif kept := [agent for agent in env.agents if found[2].get(agent) or found[3].get(agent)]:
+        raise ReaderProblem(f"step: {short(kept[0], 60)} has ended but is still in env.agents; take it out there")
     one, two, three, four, five = found
     return one, two, three, four, five
 

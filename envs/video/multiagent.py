@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from envs.parallel import ForecastParallelEnv
+from envs.parallel import ForecastParallelEnv, living
 from envs.readers import multiagent_env_id
 from envs.readers.pursuit import is_pursuit_env
 from envs.simulators.highway_multiagent import HighwayParallelEnv
@@ -319,9 +319,10 @@ def record_multiagent_episode(
     recorder = MultiagentRecorder(env, focus, num_samples, style or MultiagentStyle())
     observations, _ = env.reset(seed=seed)
     recorder.begin()
-    while env.agents and recorder.recording.num_steps != max_steps:
-        living = {agent: observations[agent] for agent in env.agents}
-        observations, rewards, _, _, _ = env.step(act(living))
+    left = list(env.agents)
+    while left and recorder.recording.num_steps != max_steps:
+        observations, rewards, terminated, truncated, _ = env.step(act({agent: observations[agent] for agent in left}))
+        left = living(env, terminated, truncated)
         recorder.note(rewards)
     return recorder.recording
 

@@ -16,6 +16,8 @@ NUM_SUBSETS = 20
 """Number of subsets, as in the paper."""
 BOOTSTRAP_DRAWS = 2000
 """Number of bootstrap draws of an interval."""
+MOST_DRAWN = 4_000_000
+"""Largest number of values that are drawn at once."""
 SMALLEST = 1e-12
 """Denominators up to this one count as 0."""
 
@@ -136,7 +138,21 @@ def bootstrap_interval(
         Lower and upper limit over the draws where the function is defined; None with fewer than two batches, or if it
         is defined nowhere.
     """
-    return None if len(sums) < 2 else central_interval(value(bootstrap_draws(len(sums), seed) @ sums))
+    return None if len(sums) < 2 else central_interval(value(bootstrap_sums(sums, seed)))
+
+
+def bootstrap_sums(
+    sums: Float[np.ndarray, "batches parts"], seed: int = 0, draws: int = BOOTSTRAP_DRAWS
+) -> Float[np.ndarray, "draws parts"]:
+    """Returns the sums over the batches of each of the draws of a bootstrap, those of `bootstrap_draws`."""
+    generator, batches = np.random.default_rng(seed), len(sums)
+    rows = max(1, MOST_DRAWN // batches)
+    return np.concatenate(
+        [
+            generator.multinomial(batches, np.full(batches, 1 / batches), size=min(rows, draws - first)) @ sums
+            for first in range(0, draws, rows)
+        ]
+    )
 
 
 def bootstrap_draws(batches: int, seed: int = 0, draws: int = BOOTSTRAP_DRAWS) -> Int[np.ndarray, "draws batches"]:

@@ -39,6 +39,14 @@ def test_differences_are_of_pairs():
     assert found["b"].interval == (1.0, 3.0)  # a quarter of the draws has twice the one, a quarter twice the other
 
 
+def test_intervals_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch: pytest.MonkeyPatch):
+    results = {"a": played(*range(30)), "b": played(*np.random.default_rng(0).normal(size=30))}
+    expected = return_differences(results, "a")
+    monkeypatch.setattr("predictor.evaluation.standard_errors.MOST_DRAWN", 100)
+    found = return_differences(results, "a")
+    assert found["b"].interval == pytest.approx(expected["b"].interval)
+
+
 def test_the_interval_is_that_of_a_normal_mean():
     """Of 400 differences with spread 2 it has half the width 1.96 · 2 / 20."""
     noise = np.random.default_rng(0).standard_normal(400)

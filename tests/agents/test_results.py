@@ -145,6 +145,18 @@ def test_success_is_a_column_where_it_is_reported():
     assert lines[3].endswith("| 33 % (6–79 %) | not reported | 25.0 |")
 
 
+@pytest.mark.parametrize("crashed_success", [False, None])
+def test_a_success_with_a_crash_does_not_show_that_failures_are_reported(crashed_success: bool | None):
+    """Of four episodes one succeeded, two said nothing, and one crashed, with a success or without a word."""
+    found = [
+        replace(EPISODES[0], success=True, crashed=None),
+        replace(EPISODES[0], success=None, crashed=None),
+        replace(EPISODES[0], success=None, crashed=None),
+        replace(EPISODES[0], success=crashed_success, crashed=True),
+    ]
+    assert Evaluation("toy-v0", 10, {"ppo": found}).summaries[0].success_rate == 0.25
+
+
 @pytest.mark.parametrize("success", [None, True])
 def test_the_table_fits_into_eighty_columns(success: bool | None):
     long = [replace(e, success=success, episode_return=10 * e.episode_return) for e in EPISODES]

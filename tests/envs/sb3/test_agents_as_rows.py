@@ -200,6 +200,36 @@ def test_an_agent_dropped_without_a_flag_counts_as_truncated_at_what_it_saw_last
     np.testing.assert_array_equal(infos[0]["terminal_observation"], row(1, "ant_0"))
 
 
+def test_an_env_that_writes_into_arrays_of_its_own_does_not_change_what_was_seen_last():
+    class Reuses(Scripted):
+        def _seen(self) -> dict[str, np.ndarray]:
+            self.arrays = getattr(self, "arrays", {a: np.zeros(n, np.float32) for a, n in SIZES.items()})
+            for agent, seen in super()._seen().items():
+                self.arrays[agent][:] = seen
+            return {agent: self.arrays[agent] for agent in self.episode[self.time]}
+
+    venvs = ParallelVecEnv([Reuses]), ParallelVecEnv([Scripted])
+    for venv in venvs:
+        venv.reset()
+    for reused, plain in zip(*(play(venv, 6) for venv in venvs), strict=True):
+        for one, other in zip(reused[3], plain[3], strict=True):
+            np.testing.assert_array_equal(one.get("terminal_observation", ()), other.get("terminal_observation", ()))
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), np.array([3, 4]), [3, 4], 3])
+def test_seeds_may_be_of_numpy(seed: Any):
+    venv = ParallelVecEnv([Scripted, Scripted])
+    venv.seed(seed)
+    venv.reset()
+    seeds = [env.resets[0][0] for env in venv.envs]
+    assert seeds == [3, 4] and all(type(one) is int for one in seeds)
+
+
+def test_each_copy_needs_a_seed():
+    with pytest.raises(UserError, match="seed needs a number, or one for each of 2 copies, got 1"):
+        ParallelVecEnv([Scripted, Scripted]).seed([3])
+
+
 def test_an_env_that_never_empties_its_agents_still_ends():
     class Keeps(Scripted):
         def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from envs.sb3 import workers
 from envs.sb3.workers import WorkerVecEnv
 from envs.supervision import EnvironmentFailedError, SupervisedEnv
+from predictor.support.errors import UserError
 from tests.envs.misbehaving import NUM_STEPS, env_id
 
 
@@ -98,6 +99,22 @@ def test_all_processes_together_get_the_time_to_close(monkeypatch: pytest.Monkey
     venv.close()
     assert clock[:4] == [100.0, *[100.0 + workers.CLOSE_S] * 3]  # before they are killed
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_a_slip_of_the_caller_leaves_the_processes_in_order():
+    makers, actions = [Make("Fine"), Make("Fine")], np.array([0, 1])
+    worker, own = WorkerVecEnv(makers, "toy-v0"), DummyVecEnv(makers)
+    for venv in (worker, own):
+        venv.seed(1)
+        venv.reset()
+    with pytest.raises(UserError, match="a step needs one action for each of 2 envs, got 1"):
+        worker.step(actions[:1])
+    with pytest.raises(AttributeError, match="the environments have no attribute 'nothing'"):
+        worker.get_attr("nothing")
+    np.testing.assert_array_equal(worker.step(actions)[0], own.step(actions)[0])
+    assert worker.get_attr("render_mode") == own.get_attr("render_mode")
+    worker.close()
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -448,13 +449,55 @@ def test_an_envpool_that_hides_its_vehicles_is_named(monkeypatch: pytest.MonkeyP
         make_pool("Merge-v0", [0])
 
 
-@pytest.mark.parametrize("action", [-1, 5])
-def test_actions_that_do_not_exist_are_named(action: int):
-    env = EnvPoolEnv("HighwayFast-v0")
+@pytest.mark.parametrize("action", [-1, 5, 1.5])
+def test_actions_that_do_not_exist_are_named(action: float):
+    env, venv = EnvPoolEnv("HighwayFast-v0"), small_pool()
     env.reset(seed=0)
-    with pytest.raises(UserError, match=f"action must be in 0…4, got {action}"):
+    venv.reset()
+    with pytest.raises(UserError, match=rf"action must be a whole number in 0…4, got \[{action}\]"):
         env.step(action)
+    with pytest.raises(UserError, match=rf"action must be a whole number in 0…4, got .*{action}"):
+        venv.step(np.array([1, action, 1]))
     env.step(4)
+    env.step(np.array(4))
+    venv.step(ACTIONS[0])
+
+
+@pytest.mark.parametrize("actions", [np.zeros(2), np.zeros((2, 3)), np.full((2, 2), np.nan), [["a", "b"]] * 2])
+def test_continuous_actions_of_another_kind_are_named(actions: Any):
+    """Some of them end the process where EnvPool gets them."""
+    venv = EnvPoolVecEnv("Racetrack-v0", 2, seed=0)
+    venv.reset()
+    venv.step(np.zeros((2, *venv.action_space.shape)))
+    with pytest.raises(UserError, match="a step needs one action for each of 2 envs, of shape|must be finite numbers"):
+        venv.step(actions)
+
+
+def test_rewards_that_are_not_finite_end_in_a_line(monkeypatch: pytest.MonkeyPatch):
+    env, venv = EnvPoolEnv("HighwayFast-v0"), small_pool()
+    for made, action in ((env, 1), (venv, ACTIONS[0])):
+        made.reset()
+        inner = made._pool.step
+        pool = SimpleNamespace(
+            step=lambda actions, inner=inner: [x * np.nan if i == 1 else x for i, x in enumerate(inner(actions))]
+        )
+        monkeypatch.setattr(made, "_pool", pool)
+        with pytest.raises(UserError, match="HighwayFast-v0 gave rewards that are not finite: .*nan"):
+            made.step(action)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"duration": "x"}, "does not take the settings {'duration': 'x'}: their types do not fit"),
+        ({"policy_frequency": 0}, "does not take the settings {'policy_frequency': 0}: "),
+        ({"num_threads": -1}, "num_threads must be at least 0, got -1"),
+    ],
+)
+def test_settings_of_another_kind_are_named(settings: dict[str, Any], message: str):
+    with pytest.raises(UserError, match=message) as raised:
+        EnvPoolVecEnv("HighwayFast-v0", 2, **settings)
+    assert "\n" not in str(raised.value)
 
 
 def test_stepping_past_the_end_is_named():
@@ -492,7 +535,7 @@ def test_stepping_before_the_first_reset_is_named():
 def test_every_env_needs_an_action():
     venv = small_pool()
     venv.reset()
-    with pytest.raises(UserError, match="one action for each of 3 envs, got 2"):
+    with pytest.raises(UserError, match=r"one action for each of 3 envs, of shape \(3,\), got \(2,\)"):
         venv.step(ACTIONS[0, :2])
 
 
