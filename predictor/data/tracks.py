@@ -126,20 +126,21 @@ def read_recording(path: Path, config: TracksConfig, counts: Counter[str]) -> Re
     keys: list[tuple[int, int]] = []
     values: list[list[float]] = []
     seen: dict[tuple[int, int], int] = {}
+    begun = False
     for number, text in enumerate(read_lines(path), start=1):
         words = _words(_COMMENT.split(text, maxsplit=1)[0])
         if not words:
             continue
         chosen = _chosen(path, number, words, config)
-        if not keys and not any(_is_number(word) for word in chosen[:4]):
+        first, begun = not begun, True
+        if first and not any(_is_number(word) for word in chosen[:4]):
             counts["lines of names skipped"] += 1
             continue
         frame, agent = _whole(chosen[0], "frame", path, number), _whole(chosen[1], "id", path, number)
         if agent < 0:
             raise bad_line(path, number, f"id must be at least 0, got {agent}")
         if seen.setdefault((agent, frame), number) != number:
-            first = seen[agent, frame]
-            raise bad_line(path, number, f"agent {agent} has frame {frame} in line {first} already")
+            raise bad_line(path, number, f"agent {agent} has frame {frame} in line {seen[agent, frame]} already")
         names = ("x", "y", *(f"column {column}" for column in config.extra_columns))
         values.append([finite(word, name, path, number) for name, word in zip(names, chosen[2:], strict=True)])
         keys.append((frame, agent))
@@ -151,11 +152,9 @@ def read_recording(path: Path, config: TracksConfig, counts: Counter[str]) -> Re
 
 
 def _words(text: str) -> list[str]:
-    """Returns the columns of a line; an empty one between two commas or semicolons stays one."""
-    for separator in (";", ","):
-        if separator in text:
-            return [word.strip() for word in text.split(separator)]
-    return text.split()
+    """Returns the columns of a line without quotes; an empty one between two commas or semicolons stays one."""
+    separator = next((sign for sign in (";", ",") if sign in text), None)
+    return [word.strip().strip('"') for word in text.split(separator)]
 
 
 def _chosen(path: Path, number: int, words: list[str], config: TracksConfig) -> list[str]:

@@ -81,6 +81,7 @@ WRITTEN = {
     "a comma at the end": text_of(WALK, ",").replace("\n", ",\n"),
     "comments": "# frame id x y\n\n% more\n" + text_of(WALK).replace("\n", " # said\n\n"),
     "names": "frame,id,x,y\n" + text_of(WALK, ","),
+    "quotes": '"' + text_of(WALK, '","').replace("\n", '"\n"').removesuffix('"'),
     "Windows": text_of(WALK).replace("\n", "\r\n"),
     "a byte order mark": "\ufeff" + text_of(WALK),
     "no last end of line": text_of(WALK).rstrip("\n"),
@@ -275,6 +276,12 @@ def test_broken_lines_are_one_line(case: str, source: Path, walk: Path, loader: 
     text, message = ROW_ERRORS[case]
     change_line(walk, 2, text)
     loader.refuses(source, f"{walk}, line 2: {message}")
+
+
+def test_there_is_one_line_of_names(source: Path, walk: Path, loader: Loader):
+    """Others would be lines of tracks that are lost."""
+    walk.write_text("frame id x y\na b c d\n" + text_of(WALK))
+    loader.refuses(source, f"{walk}, line 2: frame must be a finite number, got 'a'")
 
 
 def test_an_extra_column_holds_numbers(source: Path, walk: Path, loader: Loader):
