@@ -216,6 +216,12 @@ def test_ids_of_any_width_follow_agents(forecaster: DGVAE, kind: Any):
     assert_same(narrow.forecast(), plain.forecast())
 
 
+def test_unsigned_ids_stand_behind_absent_agents():
+    here = scene(states_of(0, 0, 3), AGENTS - 1)
+    narrow = replace(here, ids=np.where(here.valid, here.ids, 0).astype(np.uint8)).behind_absent(1)
+    assert narrow.ids.tolist()[0] == PADDING_ID and narrow.ids[narrow.valid].tolist() == here.ids[here.valid].tolist()
+
+
 def test_what_is_written_into_a_scene_later_reaches_nothing(forecaster: DGVAE):
     now, stream = batch(scene(states_of(0, *range(AGENTS)), AGENTS)), online(forecaster)
     stream.observe(now)
