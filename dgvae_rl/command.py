@@ -24,7 +24,7 @@ class Command:
     does: str
     """What it does, in a line of the help."""
     extra: str
-    """Extra of the package that installs what it needs."""
+    """Extras of the package that install what it needs, with commas between."""
 
 
 COMMANDS = {
@@ -36,7 +36,7 @@ COMMANDS = {
     "evaluate-policy": Command("agents.evaluate", "measure a policy on held-out seeds, beside simple drivers", "rl"),
     "watch": Command("agents.watch", "film an episode of a policy, or play it in a window", "rl"),
     "report": Command("agents.report", "write the report of a run: config, curves, tables, films", "rl"),
-    "push": Command("agents.push", "share a checkpoint or a policy on a hub", "hub"),
+    "push": Command("agents.push", "share a checkpoint or a policy on a hub", "hub,rl"),
     "tune": Command("agents.tune", "search hyperparameters of a learning algorithm", "tune"),
     "study": Command("agents.study", "compare what policies are shown, over several seeds", "study"),
 }

@@ -113,7 +113,7 @@ def parallel_env_for_driver(env: Any, driver: str) -> Any:
     if options["arm"].shown.true_futures and note is not None and note.learners:
         raise UserError(
             f"policy {driver} was trained on arm '{options['arm'].name}' beside agents that do not learn, whose true "
-            "futures follow from their driver: only agents.evaluate can play it"
+            "futures follow from their driver: only agents.evaluate and agents.watch play it"
         )
     from envs.parallel import ForecastParallelEnv  # most drivers need no wrapper
 
@@ -135,7 +135,8 @@ def wrapper_options(path: str) -> dict[str, Any]:
     pin = note.forecaster
     arm = Arm(pin.arm, pin.layout)
     if arm.shown.other_scene:
-        raise UserError(f"policy {path} was trained on arm '{pin.arm}', a control: only agents.evaluate can play it")
+        playing = "only agents.evaluate and agents.watch play it"
+        raise UserError(f"policy {path} was trained on arm '{pin.arm}', a control: {playing}")
     what_if = {"what_if": True} if pin.num_plans else {}
     return {
         "checkpoint": pin.checkpoint, "horizon_steps": pin.horizon_steps, "num_samples": pin.num_samples,
