@@ -23,7 +23,7 @@ from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
 from envs.readers.mpe import MPE_IDS
-from envs.registry import entry_for, envpool_task_of, is_multiagent_id
+from envs.registry import entry_for, envpool_task_of, require_multiagent
 from envs.simulators.envpool import begins_alike
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import parse
@@ -162,8 +162,8 @@ class TrainPolicyConfig:
         for name in ("num_samples", "horizon_steps"):
             if self.observe == "none" and getattr(self, name) != getattr(type(self), name):
                 raise UserError(f"{name} has no effect with observe=none; leave one out")
-        if self.driver != type(self).driver and not is_multiagent_id(self.env_id):
-            raise UserError(f"driver drives the other agents of PettingZoo, {self.env_id} has one ego; leave it out")
+        if self.driver != type(self).driver:
+            require_multiagent(self.env_id, "driver", "drives the other agents of PettingZoo")
         for name in ("eval_episodes", "selection_episodes"):
             check_count(getattr(self.sizes, name), name)
         check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")

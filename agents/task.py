@@ -24,6 +24,7 @@ from envs.registry import (
     is_multiagent_id,
     make_env,
     make_multiagent_env,
+    require_multiagent,
 )
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
@@ -108,8 +109,8 @@ class Task:
         check_choices(self)
         if self.is_multiagent and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
-        if self.learners and not self.is_multiagent:
-            raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
+        if self.learners:
+            require_multiagent(self.env_id, "learners", "are for PettingZoo environments")
         check_choice("driver", self.driver, DRIVER_NAMES)
         if self.backend == "envpool":
             envpool_task_of(self.env_id)

@@ -289,6 +289,28 @@ def is_multiagent_id(env_id: str) -> bool:
     return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
 
 
+def require_multiagent(env_id: str, options: str, purpose: str) -> None:
+    """Checks that an id is one of `is_multiagent_id`, for options that other environments do not have.
+
+    Args:
+        env_id: id of an environment.
+        options: name of the options, for the message.
+        purpose: what they do there, which follows the name.
+
+    Raises:
+        UserError: it is another one, or its module cannot be imported.
+    """
+    if is_multiagent_id(env_id):
+        return
+    if ":" in env_id:
+        try:
+            load_named(env_id)
+        except UserError as error:
+            if error.__cause__ is not None:  # the module is the trouble, not what is in it
+                raise
+    raise UserError(f"{options} {purpose}, {env_id} has one ego; leave {options} out")
+
+
 def checkpoint_for(env_id: str) -> str:
     """Returns the name of the checkpoint that ships for an id, of Gymnasium or PettingZoo.
 

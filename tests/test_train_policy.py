@@ -588,7 +588,7 @@ def test_evaluating_no_run_is_one_clear_line(
     [
         ({"observe": "none", "num_samples": 6}, "num_samples has no effect with observe=none; leave one out"),
         ({"observe": "none", "horizon_steps": 3}, "horizon_steps has no effect with observe=none; leave one out"),
-        ({"driver": "mixed"}, "driver drives the other agents of PettingZoo, merge-v1 has one ego; leave it out"),
+        ({"driver": "mixed"}, "driver drives the other agents of PettingZoo, merge-v1 has one ego; leave driver out"),
         ({"eval_episodes": 20_000}, "eval_episodes must be at most 10,000, got 20000"),
     ],
 )

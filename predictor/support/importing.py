@@ -17,7 +17,8 @@ def load_named(path: str) -> Callable[..., Any]:
     try:
         found: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
     except (ImportError, ValueError) as error:
-        raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
+        hint = "is its package installed, or its folder on PYTHONPATH?"
+        raise UserError(f"cannot import '{module}' for '{path}': {error}; {hint}") from error
     except Exception as error:  # whatever the module does
         raise UserError(f"cannot import '{module}' for '{path}': {named(error)}") from error
     if not callable(found):
