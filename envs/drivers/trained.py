@@ -135,8 +135,9 @@ def wrapper_options(path: str) -> dict[str, Any]:
     pin = note.forecaster
     arm = Arm(pin.arm, pin.layout)
     if arm.shown.other_scene:
-        playing = "only agents.evaluate and agents.watch play it"
-        raise UserError(f"policy {path} was trained on arm '{pin.arm}', a control: {playing}")
+        raise UserError(
+            f"policy {path} was trained on arm '{pin.arm}', a control: only agents.evaluate and agents.watch play it"
+        )
     what_if = {"what_if": True} if pin.num_plans else {}
     return {
         "checkpoint": pin.checkpoint, "horizon_steps": pin.horizon_steps, "num_samples": pin.num_samples,

@@ -12,7 +12,7 @@ forecasts wrap the copies in `ForecastParallelEnv`: they then share one batched 
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -322,13 +322,13 @@ class _Copy:
             turn = _Turn(True, float(rewards.get(agent, 0.0)), not lives, info=dict(infos.get(agent, {})))
             if turn.done:
                 turn.truncated = not terminated.get(agent, False)
-                turn.closing = deepcopy(observations.get(agent, before[agent]))  # a reset may write into its arrays
+                last = observations.get(agent, before[agent])  # a Dict gets forecasts later, for all copies at once
+                turn.closing = last if isinstance(last, dict) else deepcopy(last)  # a reset may write into it
             turns.append(turn)
         return turns
 
-    def _enter(self, agents: Iterable[str], observations: Mapping[str, Any]) -> None:
+    def _enter(self, names: Sequence[str], observations: Mapping[str, Any]) -> None:
         """Sets the living agents and their observations."""
-        names = list(agents)
         if unknown := [agent for agent in names if agent not in self.env.possible_agents]:
             raise UserError(f"every agent must be one of possible_agents, but {unknown} are not; add them there")
         if blind := [agent for agent in names if agent not in observations]:

@@ -72,7 +72,7 @@ def test_success_that_is_reported_only_when_it_happens_is_a_share_of_all_episode
     evaluation = Evaluation("toy-v0", 10, {"good": [reached, silent], "lost": [silent, silent]})
     assert [line.success_rate for line in evaluation.summaries] == [0.5, 0.0]
     assert Evaluation("toy-v0", 10, {"lost": [silent]}).summaries[0].success_rate is None
-    told = replace(EPISODES[1], success=False)
+    told = replace(EPISODES[0], success=False)
     assert Evaluation("toy-v0", 10, {"good": [reached, told, silent]}).summaries[0].success_rate == 0.5
 
 
