@@ -89,8 +89,7 @@ def batch_interval(
     """
     if np.count_nonzero(counts) < 2:
         return None
-    drawn = bootstrap_draws(len(sums), seed)
-    totals, numbers = drawn @ sums, drawn @ counts
+    totals, numbers = bootstrap_sums(np.stack([sums, counts], axis=1), seed).T
     ratios = totals[numbers > 0] / numbers[numbers > 0]
     low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
     return float(low), float(high)

@@ -1,5 +1,10 @@
 """Where an environment keeps agents that have ended in `agents`, episodes end all the same."""
 
+from pathlib import Path
+
+import pytest
+
+from agents import watch
 from agents.arena import MultiagentArena
 from agents.task import Task
 from envs.entry_bank import record_bank
@@ -32,6 +37,14 @@ def test_films_end():
         return dict.fromkeys(observations, 0)
 
     assert record_multiagent_episode(forecasting(), act, seed=0).num_steps == STEPS
+
+
+def test_windows_close(monkeypatch: pytest.MonkeyPatch):
+    def act(observations: dict) -> dict:
+        return dict.fromkeys(observations, 0)
+
+    monkeypatch.setattr(watch, "load_policy", lambda *given, **options: (act, Keeping()))
+    assert watch._play_in_own_window(watch.WatchConfig(Path("policy.zip"), max_steps=9), Path("policy.zip")) == STEPS
 
 
 def test_banks_of_entries_have_whole_episodes():
