@@ -31,18 +31,20 @@ train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continu
 # Checks shapes and types of every call; without the checker at the end nothing is checked.
 SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
 
+PYTEST = .venv/bin/python -m pytest -n $(TEST_JOBS) --dist worksteal
+
 test: .venv/.tools ## run the tests but the slow ones, TEST_JOBS at a time; TEST_ARGS are pytest's
-	.venv/bin/python -m pytest -n $(TEST_JOBS) --dist worksteal $(TEST_ARGS)
+	$(PYTEST) $(TEST_ARGS)
 
 test-all: .venv/.tools ## run the slow tests as well: takes three times as long
-	$(MAKE) test TEST_ARGS="-m 'not cluster' $(TEST_ARGS)"
+	$(PYTEST) -m 'not cluster' $(TEST_ARGS)
 
 test-cluster: .venv/.tools ## run the tests on a Ray cluster of three nodes on this machine: two minutes
 	.venv/bin/python -m pip install -q -c constraints.txt -e '.[all,ray]'
 	.venv/bin/python -m pytest -m cluster tests/test_cluster.py
 
 test-shapes: .venv/.tools ## make test with shapes and types of every call checked: takes twice as long
-	$(MAKE) test TEST_ARGS="$(SHAPES) $(TEST_ARGS)"
+	$(PYTEST) $(SHAPES) $(TEST_ARGS)
 
 storm: .venv/.tools ## kill the commands at random moments, fill their disks (KILLS and POINTS times), try all bad inputs
 	.venv/bin/python -m tests.storm.kills --kills $(KILLS)

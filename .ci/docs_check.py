@@ -366,6 +366,10 @@ def main() -> int:
     outside = [str(page) for page in pages if not page.is_relative_to(ROOT)]
     if outside:
         parser.error(f"pages must be of this repository, {', '.join(outside)} is not")
+    if missing := [str(page) for page in pages if not page.is_file()]:
+        parser.error(f"pages must be files, {', '.join(missing)} is none")
+    if arguments.jobs < 1:
+        parser.error(f"--jobs must be at least 1, got {arguments.jobs}")
     within_s = math.inf if arguments.within is None else arguments.within
     if arguments.within is not None:
         pages = shuffled(pages)

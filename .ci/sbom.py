@@ -167,11 +167,13 @@ def _installed(pin: Pin) -> metadata.Distribution | None:
     return found if Version(found.version).public == Version(pin.version).public else None
 
 
-def _needs(pin: Pin, refs: Mapping[str, str]) -> list[str]:
+def _needs(pin: Pin, refs: Mapping[str, list[tuple[Pin, str]]]) -> list[str]:
+    """Returns what a pin depends on; of several pins of one package, that of what is installed here."""
     installed = _installed(pin)
     wanted = [Requirement(text) for text in (installed.requires if installed else None) or []]
     here = [one for one in wanted if one.marker is None or one.marker.evaluate({"extra": ""})]
-    return sorted({refs[name] for one in here if (name := canonicalize_name(one.name)) in refs})
+    found = [refs[name] for one in here if (name := canonicalize_name(one.name)) in refs]
+    return sorted({ref for pins in found for other, ref in pins if len(pins) == 1 or _installed(other) is not None})
 
 
 def bill_of(pins: list[Pin], version: str) -> dict[str, Any]:
@@ -182,7 +184,9 @@ def bill_of(pins: list[Pin], version: str) -> dict[str, Any]:
         version: version of this project.
     """
     components = [component_of(pin) for pin in pins]
-    refs = {pin.name: component["bom-ref"] for pin, component in zip(pins, components, strict=True)}
+    refs: dict[str, list[tuple[Pin, str]]] = {}
+    for pin, component in zip(pins, components, strict=True):
+        refs.setdefault(pin.name, []).append((pin, component["bom-ref"]))
     top = {
         "type": "application", "bom-ref": "dgvae-rl", "name": "dgvae-rl", "version": version,
         "licenses": [{"license": {"id": "MIT"}}],
@@ -200,7 +204,10 @@ def bill_of(pins: list[Pin], version: str) -> dict[str, Any]:
         "version": 1,
         "metadata": {"component": top, "tools": {"components": [{"type": "application", "name": ".ci/sbom.py"}]}},
         "components": components,
-        "dependencies": [{"ref": "dgvae-rl", "dependsOn": sorted(refs.values())}, *depends],
+        "dependencies": [
+            {"ref": "dgvae-rl", "dependsOn": sorted(component["bom-ref"] for component in components)},
+            *depends,
+        ],
     }
 
 
@@ -221,8 +228,11 @@ def main() -> int:
         except metadata.PackageNotFoundError:
             version = "0"
         bill = bill_of(pins, version)
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(bill, indent=1) + "\n", encoding="utf-8")
+        try:
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(bill, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            parser.error(f"--out cannot be written: {error}")
         licensed = sum("licenses" in component for component in bill["components"])
         print(f"{arguments.out}: {len(pins)} packages, {licensed} with a licence")
     bad = 0

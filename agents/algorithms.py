@@ -112,13 +112,14 @@ def new_model(
 def even_batches(rollout: int, most: int) -> int:
     """Returns the largest batch of at most `most` samples that divides a rollout into equal ones.
 
-    Where that is less than half of `most`, or 1, the last batch is a smaller one instead, of two samples or more where
-    that can be: one has no spread, by which recurrent PPO divides its advantages.
+    Where that is less than half of `most`, or 1, the last batch is a smaller one instead, of two samples or more: one
+    has no spread, by which recurrent PPO divides its advantages. A batch is larger than `most` where no other does.
     """
     even = next(rollout // count for count in range(-(-rollout // most), rollout + 1) if rollout % count == 0)
     if even > 1 and 2 * even >= most:
         return even
-    return next((size for size in range(min(rollout, most), 1, -1) if rollout % size != 1), min(rollout, most))
+    sizes = (*range(min(rollout, most), 1, -1), *range(most + 1, rollout + 1))
+    return next((size for size in sizes if rollout % size != 1), min(rollout, most))
 
 
 def check_learns(preset: Preset, algorithm: Algorithm, steps: int) -> None:
@@ -131,7 +132,13 @@ def check_learns(preset: Preset, algorithm: Algorithm, steps: int) -> None:
     if first >= steps:
         raise UserError(
             f"{algorithm} makes its first update after learning_starts={first:,} steps, so {steps:,} steps teach it "
-            "nothing; take more steps, or lower it (--set learning_starts=…)"
+            "nothing; take more steps, or lower learning_starts"
+        )
+    between = getattr(preset, "train_freq", 1)
+    if between > steps:
+        raise UserError(
+            f"{algorithm} makes an update every train_freq={between:,} steps of each environment, so {steps:,} steps "
+            "teach it nothing; take more steps, or lower train_freq"
         )
 
 
@@ -148,5 +155,5 @@ def check_finite(model: BaseAlgorithm) -> None:
     if not all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
         raise DivergedError(
             f"the policy's weights are not finite after {model.num_timesteps:,} steps: its training diverged; "
-            "scale rewards and observations of many thousands down, or lower the learning rate (--set learning_rate=…)"
+            "scale rewards and observations of many thousands down, or lower learning_rate"
         )

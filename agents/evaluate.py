@@ -31,6 +31,7 @@ from envs.drivers.planner import is_planner, planner_checkpoint
 from envs.drivers.trained import require_own_view
 from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
+from envs.simulators.envpool import ENV_IDS, begins_alike
 from envs.supervision import TIMEOUT_S
 from predictor.own_forecasters import is_own
 from predictor.support.command_line import parse
@@ -202,10 +203,13 @@ def main() -> None:
 
 
 def show(evaluation: Evaluation, console: Console) -> None:
-    """Prints the table of an evaluation, the policies that are nearly constant, and a note if pyarrow is missing."""
+    """Prints the table of an evaluation, the policies that are nearly constant, and notes on what it lacks."""
     console.print(evaluation.table())
     if evaluation.constant_policies:
         console.print(escape(evaluation.constant_policies))
+    copy = ENV_IDS.get(evaluation.env_id)
+    if copy is not None and begins_alike(copy):
+        console.print(f"note: EnvPool's {copy} begins every episode in the same state, so the intervals say nothing")
     if not has_pyarrow():
         console.print(escape(NO_PYARROW))
 

@@ -210,7 +210,9 @@ def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, dev
     """
     found = algorithm_of(path)
     if found != algorithm:
-        raise UserError(f"{path} is no {algorithm} policy but a {found} one; pass --algorithm {found}")
+        raise UserError(
+            f"{path} is a {found} policy, where a {algorithm} one is expected; take the file of its own run"
+        )
     model = load_policy(path, venv, device)
     with zipfile.ZipFile(path) as archive:
         if isinstance(model, OffPolicyAlgorithm) and _BUFFER_ENTRY in archive.namelist():
@@ -268,6 +270,7 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
         if isinstance(was, dict) and isinstance(now, dict):  # name the part that differs
             part = next(key for key in was if key not in now or was[key] != now[key])
             name, was, now = f"{name}.{part}", was[part], now.get(part, "not there")
+        name = {"envs": "num_envs", "partner": "driver"}.get(name, name)  # the config keeps the older names
         raise UserError(
             f"cannot resume {file.parent}: {name} was {was!r}, now {now!r}; pass the old value or choose another --out"
         )

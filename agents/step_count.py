@@ -47,7 +47,8 @@ class StepProgress(BaseCallback):
 
     def _on_training_start(self) -> None:
         done = self.model.num_timesteps
-        rollout = self.model.n_steps * self._num_envs if isinstance(self.model, OnPolicyAlgorithm) else 1
+        each = self.model.n_steps if isinstance(self.model, OnPolicyAlgorithm) else self.model.train_freq.frequency
+        rollout = each * self._num_envs
         to_come = math.ceil((self._steps - done) / rollout) * rollout
         self._shown = WorkShown("train", done + to_come, done)
         self._shown.__enter__()

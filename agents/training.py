@@ -311,6 +311,7 @@ class SelectBest(BaseCallback):
         self._measured_at, self._kept_at = 0, -1
         self._highest = -math.inf
         self._points: list[dict[str, Any]] = []
+        self._seen: set[str] = set()
         self._since = time.perf_counter()
 
     @property
@@ -370,7 +371,9 @@ class SelectBest(BaseCallback):
     def _keep(self, results: Sequence[EpisodeResult], mean: float) -> None:
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
-        for name, value in driving_scalars(results).items():
+        scalars = driving_scalars(results)
+        self._seen |= {name for name in scalars if name == "crash_rate" or name.startswith("share_")}
+        for name, value in (dict.fromkeys(self._seen, 0.0) | scalars).items():  # what no longer happens is drawn as 0
             self.logger.record(f"eval/{name}", value)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)

@@ -59,7 +59,10 @@ def dead_links(site: Path) -> Iterator[str]:
 
 def _missing(page: Path, link: str) -> str:
     """Returns what a link of a page lacks; empty for a good one and for one that leaves the site."""
-    parts = urlsplit(link)
+    try:
+        parts = urlsplit(link)
+    except ValueError:
+        return "no address"
     if parts.scheme or parts.netloc:
         return ""
     target = (page.parent / unquote(parts.path)).resolve() if parts.path else page

@@ -7,6 +7,8 @@ import subprocess
 import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = [{"slow": slow, "cluster": cluster} for slow, cluster in itertools.product((False, True), repeat=2)]
 
@@ -31,6 +33,14 @@ def test_make_test_leaves_the_slow_ones_out_and_test_all_has_them():
     (run,) = (line for line in listed.splitlines() if "-m pytest" in line)
     assert chosen(last_expression(run)) == chosen("not cluster")
     assert chosen(by_default()) == chosen("not cluster and not slow")
+
+
+@pytest.mark.parametrize("target", ["test", "test-all", "test-shapes"])
+def test_arguments_with_blanks_reach_pytest_whole(target: str):
+    command = ["make", "-n", target, 'TEST_ARGS=-k "a or b"']
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    (run,) = (line for line in listed.splitlines() if "-m pytest" in line)
+    assert shlex.split(run)[-2:] == ["-k", "a or b"]
 
 
 def test_ci_runs_what_make_test_leaves_out():

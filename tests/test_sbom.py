@@ -50,6 +50,18 @@ def test_what_is_installed_here_has_licences_and_needs():
 
 
 @pytest.mark.slow
+def test_each_release_of_a_package_with_several_is_a_part_and_the_installed_one_is_needed():
+    pins = sbom.read_pins()
+    bill = sbom.bill_of(pins, "1")
+    top, *others = bill["dependencies"]
+    assert top["dependsOn"] == sorted(component["bom-ref"] for component in bill["components"])
+    several = {pin.name for pin in pins if sum(other.name == pin.name for other in pins) > 1}
+    here = {c["bom-ref"] for pin, c in zip(pins, bill["components"], strict=True) if sbom._installed(pin) is not None}
+    refs = {c["bom-ref"] for pin, c in zip(pins, bill["components"], strict=True) if pin.name in several}
+    needed = {ref for one in others for ref in one["dependsOn"]} & refs
+    assert several and needed <= here
+
+
 def test_equal_pins_give_an_equal_bill():
     pins = sbom.read_pins()
     assert sbom.bill_of(pins, "1") == sbom.bill_of(pins, "1")

@@ -129,10 +129,13 @@ class Cell:
 
 
 def _content_of(forecaster: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Returns what names a forecaster: the hash of its weights, or its name where code makes it."""
+    """Returns what names a forecaster: the hash of its weights, or name and hash of the module whose code makes it."""
     if forecaster is None:
         return None
-    return {**forecaster, "checkpoint": forecaster["checkpoint"] if is_own(forecaster.get("checkpoint")) else None}
+    name = forecaster.get("checkpoint")
+    if not is_own(name):
+        return {**forecaster, "checkpoint": None}
+    return {**forecaster, "module": content_of(name)}
 
 
 def _named(settings: Task | Preset) -> dict[str, Any]:

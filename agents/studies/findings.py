@@ -22,14 +22,10 @@ from agents.studies.estimators import (
     probability_of_improvement,
     share_of_headroom,
 )
-from agents.studies.plan import Study
+from agents.studies.plan import Study, is_constant
 from agents.studies.results import Result
 from agents.summaries import NEARLY_CONSTANT, reports_only_events, wilson_interval
 from envs.drivers.planner import ORACLE, PLANNER, is_planner, planner_checkpoint
-from predictor.own_forecasters import is_own
-
-NOT_CONSTANT = ("random", "varied", "keep-lane", "heuristic", "mixed")
-"""Drivers that take no constant action, beside the planner and trained ones."""
 
 
 class Line(NamedTuple):
@@ -206,8 +202,8 @@ class Findings:
 
     def best_constant(self, scenario: str) -> Line | None:
         """Returns the best of the drivers that take one action in every step; None if there is none."""
-        drivers = [x for x in self.lines(scenario, trained=False) if not is_planner(x.arm) and not is_own(x.arm)]
-        constant = [x for x in drivers if x.arm not in NOT_CONSTANT and ".zip" not in x.arm]
+        drivers = [x for x in self.lines(scenario, trained=False) if not is_planner(x.arm)]
+        constant = [x for x in drivers if is_constant(x.arm)]
         return max(constant, key=lambda x: self.mean_return(scenario, x).value, default=None)
 
     def heuristic(self, scenario: str) -> Line | None:

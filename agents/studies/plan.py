@@ -39,6 +39,10 @@ _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
 _OF_FORECASTS = ("perception_m", "what_if", "sizes_of")
 """Options of a scenario that an arm without forecasts does not take."""
+_NOT_CONSTANT = ("random", "varied", "keep-lane", "heuristic", "mixed")
+"""Drivers that take no constant action, beside the planner, trained ones and one's own."""
+_OF_SCENARIO = ("env_kwargs", "learners", "driver", "crash_key", "success_key")
+"""Fields of `Task` that say which environment is played and what counts in it, which is the same for all arms."""
 _OWN = ("env_id", "observe", "timeout_s")
 """Fields of `Task` that are no options: a scenario and an arm say the first two in keys of their own, and a cell runs
 its environments in its own process."""
@@ -138,6 +142,8 @@ class Study:
                 raise UserError(f"seeds must lie in [0, {SELECTION_SEED}), got {seed}")
         if not self.algorithms or len(set(self.algorithms)) < len(self.algorithms):
             raise UserError(f"algorithms must name at least one, each once, got {list(self.algorithms)}")
+        if len(set(self.rivals or ())) < len(self.rivals or ()):
+            raise UserError(f"rivals must name arms, each once, got {list(self.rivals or ())}")
         for rival in self.rivals or ():
             if rival not in self.arm_names:
                 raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")
@@ -170,7 +176,7 @@ class Study:
         """
         arms = tuple(self._arm_called(name, key) for key, name in (("floor", self.floor), ("ceiling", self.ceiling)))
         scenarios = tuple(
-            replace(s, references=tuple(n for n in s.references if is_planner(n) or n == CONSTANT_ACTIONS))
+            replace(s, references=tuple(n for n in s.references if is_planner(n) or is_constant(n)))
             for s in self.scenarios
         )
         return replace(self, arms=arms, scenarios=scenarios, rivals=None)
@@ -183,6 +189,11 @@ class Study:
         if name not in known:
             raise UserError(f"{key} must be an arm of the study or one of {', '.join(known)}, got '{name}'")
         return StudyArm(name, name, {})
+
+
+def is_constant(driver: str) -> bool:
+    """Returns whether a driver that is no planner takes one action in every step (`CONSTANT_ACTIONS`: one of each)."""
+    return driver not in _NOT_CONSTANT and not is_own(driver) and not driver.endswith(".zip")
 
 
 def shipped_studies() -> tuple[str, ...]:
@@ -295,6 +306,9 @@ def _arm(entry: Any, where: str) -> StudyArm:
         missing = "" if "observe" in table else "; a table with another name needs the key observe"
         raise UserError(f"{where}: unknown arm {observe!r}; there are {', '.join(known)}{missing}")
     options = {key: value for key, value in table.items() if key not in ("name", "observe")}
+    for key in options:
+        if key in _OF_SCENARIO:
+            raise UserError(f"{where}.{name}: {key} would let this arm play another environment; give it to a scenario")
     return StudyArm(name, observe, _task_options(options, f"{where}.{name}"))
 
 

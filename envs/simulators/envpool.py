@@ -60,7 +60,10 @@ ENV_IDS: dict[str, str] = {f"envpool/{task_id}": task_id for task_id in HIGHWAY_
 # Named otherwise, since gymnasium would call it a newer version of Intersection-v0: its actions are continuous.
 ENV_IDS["envpool/IntersectionContinuous-v1"] = "Intersection-v1"
 MAX_SEED = 2**31 - 1
-_OWN_SETTINGS = ("num_envs", "batch_size", "seed", "env_seed", "max_num_players", "gym_reset_return_info", "base_path")
+_OWN_SETTINGS = (
+    "num_envs", "num_threads", "batch_size", "seed", "env_seed", "max_num_players", "gym_reset_return_info",
+    "base_path",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,9 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
     known = [k for k in envpool.make_spec(task_id).config._fields if k not in _OWN_SETTINGS]
     if unknown := set(settings) - {*known, "render_mode"}:
         raise UserError(f"EnvPool's {task_id} has no setting {sorted(unknown)}; it has {', '.join(known)}")
+    shown = settings.get("observation_vehicles_count", 1)
+    if isinstance(shown, int) and shown < 1:  # EnvPool itself ends the process at 0
+        raise UserError(f"observation_vehicles_count must be at least 1, got {shown}")
     try:
         pool = envpool.make(
             task_id,

@@ -222,5 +222,7 @@ def test_policy_of_other_spaces_is_refused(tmp_path: Path, venv: VecEnv):
 
 def test_policy_of_another_algorithm_is_refused(tmp_path: Path, venv: VecEnv):
     save_model(make_ppo(venv), tmp_path / "model.zip")
-    with pytest.raises(UserError, match="is no dqn policy but a ppo one; pass --algorithm ppo"):
+    with pytest.raises(
+        UserError, match="model.zip is a ppo policy, where a dqn one is expected; take the file of its own run"
+    ):
         load_model(tmp_path / "model.zip", "dqn")

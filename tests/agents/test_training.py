@@ -10,6 +10,7 @@ import pytest
 import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.algorithms import DivergedError, check_finite, even_batches
@@ -133,6 +134,10 @@ def test_steps_that_teach_nothing_are_refused():
         plan(algorithm="dqn", steps=200)
     assert plan(algorithm="dqn", steps=201).steps == 201
     assert plan(algorithm="dqn", steps=200, settings={"learning_starts": 199}).steps == 200
+    early = {"learning_starts": 10, "train_freq": 65}
+    with pytest.raises(UserError, match=r"dqn makes an update every train_freq=65 steps .* so 64 steps teach it"):
+        plan(algorithm="dqn", steps=64, settings=early)
+    assert plan(algorithm="dqn", steps=65, settings=early).steps == 65
 
 
 @pytest.mark.parametrize("every_steps", [2, 8])
@@ -323,7 +328,8 @@ def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
         (600, 480, 300),
         (1600, 480, 400),
         (7, 4, 4),
-        (3, 2, 2),
+        (3, 2, 3),
+        (7, 3, 4),
         (65, 64, 63),
         (193, 64, 63),
     ],
@@ -508,6 +514,28 @@ def test_tensorboard_shows_crashes_speed_and_actions():
     shown = driving_scalars([first, second])
     assert shown == {"crash_rate": 0.5, "speed_mps": 25.0, "share_faster": 0.5, "share_idle": 0.5}
     assert driving_scalars([EpisodeResult(0, 1.0, 1, None, float("nan"))]) == {}
+
+
+def test_tensorboard_draws_what_no_longer_happens_as_zero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    happened: list[dict[str, Any]] = [
+        {"crashed": True, "action_counts": {"faster": 1, "idle": 1}},
+        {"crashed": None, "action_counts": {"idle": 2}},
+    ]
+    drawn: list[dict[str, Any]] = []
+    select = SelectBest(Scripted([1.0], [1.0]), tmp_path / "best.zip", 1, every_steps=8)
+    play = select._arena.play
+    monkeypatch.setattr(select._arena, "play", lambda *args: [replace(e, **happened.pop(0)) for e in play(*args)])
+    model = make_ppo()
+    logger = configure(None, [])
+    monkeypatch.setattr(logger, "dump", lambda step: drawn.append(dict(logger.name_to_value)))
+    model.set_logger(logger)
+    model.learn(16, callback=select)
+    assert happened == []
+    shown = [{key: one[f"eval/{key}"] for key in ("crash_rate", "share_faster", "share_idle")} for one in drawn[-2:]]
+    assert shown == [
+        {"crash_rate": 1.0, "share_faster": 0.5, "share_idle": 0.5},
+        {"crash_rate": 0.0, "share_faster": 0.0, "share_idle": 1.0},
+    ]
 
 
 def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():

@@ -36,6 +36,7 @@ def test_good_links_and_links_to_other_hosts_pass(site: Path, monkeypatch: pytes
         ('<a href="none.html">x</a>', "c.html:1: none.html: no such file"),
         ('\n<img src="none.png">', "c.html:2: none.png: no such file"),
         ('<a href="sub/b.html#here">x</a>', "c.html:1: sub/b.html#here: b.html has no id 'here'"),
+        ('<a href="http://[bad">x</a>', "c.html:1: http://[bad: no address"),
         ('<a href="#here">x</a>', "c.html:1: #here: c.html has no id 'here'"),
     ],
 )

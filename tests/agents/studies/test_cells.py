@@ -62,6 +62,18 @@ def test_the_code_of_a_driver_of_ones_own_is_in_the_name(
     assert names[0] != names[1]
 
 
+def test_the_code_of_a_forecaster_of_ones_own_is_in_the_name(
+    cells: Callable[..., list[Cell]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    module, code, names = tmp_path / "my_study_forecaster.py", Path("docs/examples/mean_velocity.py").read_text(), []
+    arms = '[{name = "own", observe = "forecast", checkpoint = "own:my_study_forecaster:MeanVelocity"}]'
+    for ending in ("", "\n# changed\n"):
+        module.write_text(code + ending)
+        names += [c.name for c in cells(env_id=HIGHWAY, seeds="1", arms=arms, references="[]")]
+    assert len(set(names)) == 2
+
+
 def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell]]):
     """So that cells which are finished stay."""
     none, zeros = cells(env_id=HIGHWAY, seeds="1", arms='["none", "zeros"]', references="[]")

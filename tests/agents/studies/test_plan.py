@@ -118,6 +118,15 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
             study_text(algorithms="{ppo = {n_steps = 3.5}}"),
             "corridor.toml: algorithms.ppo: n_steps must be a whole number, got 3.5",
         ),
+        (study_text(rivals='["none", "none"]'), r"corridor.toml: rivals must name arms, each once, got .*'none'\]"),
+        (
+            study_text(arms='["none", {name = "long", observe = "none", env_kwargs = {duration = 60}}]'),
+            "corridor.toml: arms.long: env_kwargs would let this arm play another environment; give it to a scenario",
+        ),
+        (
+            study_text(arms='["none", {name = "other", observe = "none", learners = ["agent_0"]}]'),
+            "corridor.toml: arms.other: learners would let this arm play another environment",
+        ),
         (study_text(rivals='["zeroes"]'), "corridor.toml: rivals names 'zeroes', which is no arm; there are none"),
         (study_text(floor='"zeroes"'), "corridor.toml: floor must be an arm of the study or one of forecast.*'zeroes'"),
         (study_text(ceiling='"orcale"'), "corridor.toml: ceiling must be an arm of the study or one of .*'orcale'"),
@@ -153,7 +162,7 @@ def test_headroom_has_floor_and_ceiling_alone(tmp_path: Path):
     text = study_text(floor='"none"', ceiling='"forecast"', references='["random", "planner@0.3", "slower", "planner"]')
     study = read_study(study_path(tmp_path, text)).headroom_only()
     assert study.arm_names == ("none", "forecast")
-    assert study.scenarios[0].references == ("planner@0.3", "planner")
+    assert study.scenarios[0].references == ("planner@0.3", "slower", "planner")
     text = study_text(floor='"ground"', ceiling='"forecast"')
     with pytest.raises(UserError, match="floor must be an arm of the study or one of .*, got 'ground'"):
         read_study(study_path(tmp_path, text)).headroom_only()
