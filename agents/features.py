@@ -57,13 +57,17 @@ class AttentionConfig:
     """Divisor of positions as second input, x / far_m, which does not saturate [m]."""
     speed_mps: float = 30.0
     """Divisor of relative velocities [m/s]; default: highway-env's top speed."""
+    more_scales: tuple[float, ...] = ()
+    """Divisor of each further feature of an agent (a height, a size); () leaves them as they are."""
 
     @classmethod
     def for_scenes(cls, spec: SceneSpec) -> "AttentionConfig":
         """Returns the scales that fit scenes of this layout: 10 m, 50 m and 30 m/s on roads, less in small arenas."""
         axes = spec.position_dim
         position_m, velocity_mps = max(spec.feature_scales[:axes]), max(spec.feature_scales[axes : 2 * axes])
-        return cls(near_m=NEAR * position_m, far_m=FAR * position_m, speed_mps=SPEED * velocity_mps)
+        more = spec.feature_scales[2 * axes :]
+        more = more if any(scale != 1 for scale in more) else ()
+        return cls(near_m=NEAR * position_m, far_m=FAR * position_m, speed_mps=SPEED * velocity_mps, more_scales=more)
 
     def __post_init__(self) -> None:
         """Checks that the fields fit together.
@@ -73,8 +77,9 @@ class AttentionConfig:
         """
         if min(self.width, self.hidden, self.heads) < 1 or self.width % self.heads:
             raise UserError(f"width must be a multiple of heads, both positive, got {self.width} and {self.heads}")
-        if min(self.near_m, self.far_m, self.speed_mps) <= 0:
-            raise UserError(f"scales must be positive, got {self.near_m}, {self.far_m}, {self.speed_mps}")
+        scales = (self.near_m, self.far_m, self.speed_mps, *self.more_scales)
+        if min(scales) <= 0:
+            raise UserError(f"scales must be positive, got {', '.join(map(str, scales))}")
 
 
 class ForecastAttention(BaseFeaturesExtractor):
@@ -106,7 +111,7 @@ class ForecastAttention(BaseFeaturesExtractor):
                 f"ForecastAttention needs a Dict with the key '{OWN_KEY}', or the environment's own keys, got "
                 f"{observation_space}"
             )
-        ego_dim = sum(get_flattened_obs_dim(space) for space in own.values())
+        ego_dim = int(sum(get_flattened_obs_dim(space) for space in own.values()))  # NumPy's integer is none to torch
         super().__init__(observation_space, features_dim=ego_dim + config.width)
         self.config = config
         shapes = {k: space.shape or () for k, space in observation_space.items()}
@@ -115,6 +120,10 @@ class ForecastAttention(BaseFeaturesExtractor):
         self.ego = nn.Sequential(
             nn.Linear(ego_dim, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.width), nn.ReLU()
         )
+        self.register_buffer("more_scales", torch.tensor(config.more_scales), persistent=False)
+        further = shapes["agents"][-1] - 4 if "agents" in self._keys else 0
+        if further and len(config.more_scales) not in (0, further):
+            raise UserError(f"more_scales must be one for each of {further} further features, got {config.more_scales}")
         # A token depends on the ego: its first layer also gets the ego's embedding.
         token_dim = self._token_dim(shapes)
         self.token_in = nn.Linear(token_dim, config.hidden) if token_dim else None
@@ -168,7 +177,8 @@ class ForecastAttention(BaseFeaturesExtractor):
         parts: list[Tensor] = []
         if "agents" in self._keys:
             agents = present["agents"]
-            parts += [self._squash(agents[:, :2]), agents[:, 2:4] / self.config.speed_mps, agents[:, 4:]]
+            more = agents[:, 4:] / self.more_scales if len(self.more_scales) else agents[:, 4:]
+            parts += [self._squash(agents[:, :2]), agents[:, 2:4] / self.config.speed_mps, more]
         if "forecast" in self._keys:
             forecast = present["forecast"]  # agents [samples] horizon 2
             path = present.get(EGO_PATH)  # agents horizon 2

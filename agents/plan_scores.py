@@ -41,7 +41,10 @@ def plan_actions(task: Task) -> tuple[int, ...] | None:
     env.close()
     if not isinstance(env.action_space, gym.spaces.Discrete):
         return None
-    actions: tuple[int, ...] | None = getattr(plan_model_for(env), "actions", None)
+    model = plan_model_for(env)
+    actions: tuple[int, ...] | None = getattr(model, "actions", None)
+    if actions is not None and not all(env.action_space.contains(action) for action in actions):
+        raise UserError(f"{type(model).__name__}.actions must be actions of {env.action_space}, got {actions}")
     return actions
 
 

@@ -341,7 +341,7 @@ def task_of(
         if re.search(r"[.:]", text) and not text.startswith(_OWN_PACKAGES):  # highway-env imports what is before a dot
             raise UserError(
                 f"env_kwargs of the run name '{short(text, 80)}', which the environment could import; "
-                "play such a run from Python, with agents.task.Task, if you trust it"
+                "if you trust it, make the environment yourself and play the run in it: load_policy(run, env)"
             )
     return task
 

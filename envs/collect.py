@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from envs.drivers.content import content_of
+from envs.drivers.content import content_of, content_of_module
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
 from envs.registry import arguments_of
 from envs.rollouts.branch_recording import branch_mix_for
@@ -322,7 +322,8 @@ def _settings(config: CollectConfig, info: StoreInfo) -> dict[str, Any]:
     """Returns all that an episode depends on, for recordings that are taken up again."""
     given = {name: value for name, value in asdict(config).items() if name not in FREE}
     made = {name: info.provenance[name] for name in ("commit", "versions")}
-    return given | made | {"drivers": config.drivers, "content_of_drivers": list(map(content_of, config.drivers))}
+    drivers = {"drivers": config.drivers, "content_of_drivers": list(map(content_of, config.drivers))}
+    return given | made | drivers | {"content_of_env": content_of_module(config.env_id), "spec": asdict(info.spec)}
 
 
 def _kept(config: CollectConfig, partial: PartialStore) -> str:

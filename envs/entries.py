@@ -156,9 +156,14 @@ def path_entries(
 
 
 def what_if_entries(
-    scenes: SceneBatch, forecast: Forecast, size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0)
+    scenes: SceneBatch,
+    forecast: Forecast,
+    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0),
+    dt_s: float = 1.0,
 ) -> dict[str, NDArray[np.float32]]:
     """Returns what a forecast with plans says of the ego and each other agent of this size, agents as in `ego_entries`.
+
+    Steps are `dt_s` seconds long.
 
     Returns:
         what_if_gap: (B, A−1, P) smallest gap between both vehicles in the single forecast of each plan [m], negative
@@ -166,7 +171,7 @@ def what_if_entries(
         what_if_contact: (B, A−1, P) time of their first contact there, as a share of the horizon; 1 without any.
         what_if_risk: (B, A−1, P) probability of a contact over the forecast's samples.
     """
-    found = contacts(forecast, scenes, size_m)
+    found = contacts(forecast, scenes, size_m, dt_s)
     order = others_by_distance(scenes)
     envs = np.arange(len(order))[:, None]
     valid = scenes.valid[envs, 1 + order][..., None]

@@ -189,7 +189,10 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
         None if given is None else names.get(given), config.env_kwargs,
     )  # fmt: skip
     if not result.model.agents:
-        raise UserError(f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps or add episodes")
+        raise UserError(
+            f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps, add episodes, or raise "
+            f"perception_m={spec.perception_m:g} if the ego sees nobody"
+        )
     cases = sorted((e.worst for e in episodes if e.worst is not None), key=lambda case: -case.error_m)
     return result, cases[:GALLERY_CASES]
 

@@ -170,7 +170,7 @@ class ForecastStream(SceneStream):
         entries |= path_entries(scenes, entries["forecast"], self.scene_spec.dt_s)
         if plans is not None and self.config.num_plans:
             planned = self.what_if(plans.states) if true is None else as_forecast(true, scenes, forecast)
-            entries |= what_if_entries(scenes, planned, plans.size_m)
+            entries |= what_if_entries(scenes, planned, plans.size_m, self.scene_spec.dt_s)
             self.planned = planned
         return entries if arm.changes_nothing else arm.filled(entries, self._spaces)
 

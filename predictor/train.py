@@ -75,7 +75,8 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         trainer.close()
         raise UserError(
             f"no agent of the validation windows is there for all {config.horizon_steps} steps of future, so no "
-            "checkpoint could be chosen; lower --horizon-steps, draw more with --val-windows, or use longer tracks"
+            "checkpoint could be chosen; lower --horizon-steps, draw more with --val-windows, use longer tracks, or "
+            "raise perception_m if the ego sees nobody"
         )
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     with ExitStack() as stack:

@@ -41,6 +41,8 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     Raises:
         UserError: unknown name, or a driver that does not support this action space.
     """
+    if name in ("random", "varied"):
+        uniform_action(env.action_space, np.random.default_rng(0), WHO)  # so that it fails before the first step
     if name == "random":
         return partial(_random, env.action_space, rng)
     if name == "idle":

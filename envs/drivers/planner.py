@@ -218,7 +218,7 @@ class Planner:
             assert true is not None
             forecast = as_forecast(true[None], scenes, forecast)
         length_m, width_m = (size + plans.margin_m for size in plans.size_m)  # half of it around each agent
-        survival = contacts(forecast, scenes, (length_m, width_m)).survival()[0]
+        survival = contacts(forecast, scenes, (length_m, width_m), self._spec.dt_s).survival()[0]
         self.survival = survival if plans.crashed is None else survival * ~plans.crashed
         self.plans, self.chosen = plans, choose(plans, self.survival, self.config.max_risk)
         return plans.actions[self.chosen]

@@ -10,6 +10,9 @@ import numpy as np
 from envs.own_observation import require_space
 from predictor.support.errors import UserError
 
+OWN_DRIVER = "drive it with one of your own, own:module:function (docs/wrap_your_env.md)"
+"""What to do where no driver knows the actions."""
+
 
 def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
     """Returns an action drawn uniformly.
@@ -33,7 +36,9 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
             return rng.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
         return np.asarray(rng.uniform(space.low, space.high), dtype=space.dtype)
     require_space(space, "the action space")
-    raise UserError(f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}")
+    raise UserError(
+        f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}; {OWN_DRIVER}"
+    )
 
 
 def first_action(space: gym.Space) -> Any:
@@ -50,7 +55,7 @@ def first_action(space: gym.Space) -> Any:
         return np.zeros(space.shape, dtype=space.dtype)
     if isinstance(space, gym.spaces.Box):
         return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
-    raise UserError(f"no idle action is known for {space}")
+    raise UserError(f"no idle action is known for {space}; {OWN_DRIVER}")
 
 
 def varied_actions(space: gym.Space, rng: np.random.Generator, who: str) -> Callable[[Any], Any]:

@@ -1,8 +1,9 @@
 """Contacts between an ego that follows plans and the forecast of other agents: gaps, times and probabilities.
 
 Every agent is a rectangle along its direction of motion, all of one size. Between two steps agents move straight,
-and are compared at several instants. The gap of two rectangles is the largest separation along an axis of one of them:
-at most their distance, and negative exactly where they overlap.
+and are compared at several instants; where they move so fast that two instants could lie before and after a contact,
+the least gap between these is searched. The gap of two rectangles is the largest separation along an axis of one of
+them: at most their distance, and negative exactly where they overlap.
 """
 
 from typing import NamedTuple
@@ -14,8 +15,10 @@ from predictor.scene import Forecast, SceneBatch
 
 INSTANTS = 5
 """Number of instants at which agents are compared in each step."""
-LEAST_MOVE_M = 0.1
-"""Shortest move between two steps that has a direction [m]; shorter ones keep the heading."""
+SEARCHES = 24
+"""Number of halvings of a search for the least gap: a hundred million parts of a step."""
+LEAST_SPEED_MPS = 0.1
+"""Lowest speed that has a direction [m/s]; slower agents keep their heading."""
 FAR_M = 1000.0
 """Largest gap [m], so that a far agent does not become infinite."""
 
@@ -54,6 +57,7 @@ def contacts(
     forecast: Forecast,
     scenes: SceneBatch,
     size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0),
+    dt_s: float = 1.0,
 ) -> Contacts:
     """Computes the contacts of the ego with the other agents of each scene.
 
@@ -62,15 +66,16 @@ def contacts(
         scenes: observed scenes, which give where and how agents move now.
         size_m: length and width of every agent [m], of all scenes or of each. Which way another agent faces is known
             from its motion alone: one that stands still, and is forecast to, is taken to face along x.
+        dt_s: time between two steps [s].
     """
     xy = forecast.xy.cpu().numpy().astype(np.float64)
     batch, plans, samples, agents, horizon = xy.shape[:5]
     now_m = (scenes.states[..., :2] - scenes.states[:, :1, :2])[:, None, None, :, None]
     path = np.concatenate([np.broadcast_to(now_m, (*xy.shape[:4], 1, 2)), xy], axis=-2)
     heading_rad = np.arctan2(scenes.states[..., 3], scenes.states[..., 2])
-    slow = np.hypot(scenes.states[..., 2], scenes.states[..., 3]) < LEAST_MOVE_M
+    slow = np.hypot(scenes.states[..., 2], scenes.states[..., 3]) < LEAST_SPEED_MPS
     heading_rad[:, 0] = np.where(slow[:, 0], scenes.heading_rad, heading_rad[:, 0])
-    headings = _headings(path, np.broadcast_to(heading_rad[:, None, None], xy.shape[:4]))
+    headings = _headings(path, np.broadcast_to(heading_rad[:, None, None], xy.shape[:4]), LEAST_SPEED_MPS * dt_s)
     sizes = np.broadcast_to(np.asarray(size_m, np.float64), (batch, 2)).T.reshape(2, batch, 1, 1, 1, 1)
     gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], sizes)
     gap = np.where(scenes.valid[:, None, None, 1:, None, None], gap, FAR_M).clip(max=FAR_M)
@@ -85,12 +90,12 @@ def contacts(
 
 
 def _headings(
-    path: Float[np.ndarray, "*batch points 2"], now_rad: Float[np.ndarray, "*batch"]
+    path: Float[np.ndarray, "*batch points 2"], now_rad: Float[np.ndarray, "*batch"], least_m: float
 ) -> Float[np.ndarray, "*batch steps"]:
-    """Returns the direction of each move along a path [rad]; the one before where an agent hardly moves."""
+    """Returns the direction of each move along a path [rad]; the one before where a move is shorter than `least_m`."""
     moves = np.diff(path, axis=-2)
     directions = np.arctan2(moves[..., 1], moves[..., 0])
-    moving = np.hypot(moves[..., 0], moves[..., 1]) >= LEAST_MOVE_M
+    moving = np.hypot(moves[..., 0], moves[..., 1]) >= least_m
     found, before = [], now_rad
     for step in range(moves.shape[-2]):
         before = np.where(moving[..., step], directions[..., step], before)
@@ -105,17 +110,70 @@ def _gaps(
     others_rad: Float[np.ndarray, "*batch steps"],
     size_m: Float[np.ndarray, "2 ..."],
 ) -> Float[np.ndarray, "*batch steps instants"]:
-    """Computes the gap of two rectangles at the instants of each step [m]."""
+    """Computes the gap of two rectangles at the instants of each step [m].
+
+    The instant with the smallest gap has the least one of its step where agents move more than twice the smaller side
+    against each other from one instant to the next. That is exact, as the gap of a step is a convex function of time.
+    """
     between, (length_m, width_m) = others - ego, size_m
-    when = np.arange(1, INSTANTS + 1)[:, None] / INSTANTS
-    offset = between[..., :-1, None, :] + when * np.diff(between, axis=-2)[..., None, :]
+    start, move = between[..., :-1, :], np.diff(between, axis=-2)
     cos, sin = np.abs(np.cos(others_rad - ego_rad)), np.abs(np.sin(others_rad - ego_rad))
-    reach_along = (length_m + length_m * cos + width_m * sin) / 2
-    reach_across = (width_m + length_m * sin + width_m * cos) / 2
-    gap = np.full(offset.shape[:-1], -np.inf)
-    for heading in (ego_rad, others_rad):
-        along, across = np.cos(heading)[..., None], np.sin(heading)[..., None]
-        x, y = offset[..., 0], offset[..., 1]
-        gap = np.maximum(gap, np.abs(x * along + y * across) - reach_along[..., None])
-        gap = np.maximum(gap, np.abs(y * along - x * across) - reach_across[..., None])
+    along, across = (length_m + length_m * cos + width_m * sin) / 2, (width_m + length_m * sin + width_m * cos) / 2
+    headings = np.stack(np.broadcast_arrays(ego_rad, others_rad), -1)
+    when = np.arange(1, INSTANTS + 1) / INSTANTS
+    gap = _gap_at(when, start, move, headings, along, across)
+    fast = np.hypot(move[..., 0], move[..., 1]) > 2 * INSTANTS * np.minimum(length_m, width_m)
+    if fast.any():
+        parts = (part[fast] for part in np.broadcast_arrays(start[..., 0], start[..., 1], move[..., 0], move[..., 1]))
+        x, y, dx, dy = parts
+        args = (np.stack([x, y], -1), np.stack([dx, dy], -1), headings[fast], along[fast], across[fast])
+        least, at = _least_gap(*args), gap[fast].argmin(-1)
+        found = gap[fast]
+        found[np.arange(len(at)), at] = np.minimum(found[np.arange(len(at)), at], least)
+        gap[fast] = found
     return gap
+
+
+def _gap_at(
+    when: Float[np.ndarray, "*#batch instants"],
+    start: Float[np.ndarray, "*batch 2"],
+    move: Float[np.ndarray, "*batch 2"],
+    headings: Float[np.ndarray, "*batch 2"],
+    along: Float[np.ndarray, "*batch"],
+    across: Float[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch instants"]:
+    """Computes the gap at instants of a step, which are shares of it [m].
+
+    Args:
+        when: the instants.
+        start: offset of the other's centre from the ego's at the step's beginning [m].
+        move: change of the offset in the step [m].
+        headings: direction of the ego and of the other [rad].
+        along: half the reach of both along a heading [m].
+        across: half the reach of both across a heading [m].
+    """
+    x, y = (start[..., axis, None] + when * move[..., axis, None] for axis in (0, 1))
+    gap = np.full(x.shape, -np.inf)
+    for who in (0, 1):
+        cos, sin = np.cos(headings[..., who, None]), np.sin(headings[..., who, None])
+        gap = np.maximum(gap, np.abs(x * cos + y * sin) - along[..., None])
+        gap = np.maximum(gap, np.abs(y * cos - x * sin) - across[..., None])
+    return gap
+
+
+def _least_gap(
+    start: Float[np.ndarray, "some 2"],
+    move: Float[np.ndarray, "some 2"],
+    headings: Float[np.ndarray, "some 2"],
+    along: Float[np.ndarray, " some"],
+    across: Float[np.ndarray, " some"],
+) -> Float[np.ndarray, " some"]:
+    """Computes the least gap within a step by ternary search, the arguments as those of `_gap_at` [m]."""
+    low, high = np.zeros(len(start)), np.ones(len(start))
+    for _ in range(2 * SEARCHES):
+        third = (high - low) / 3
+        when = np.stack([low + third, high - third], -1)
+        first, second = _gap_at(when, start, move, headings, along, across).T
+        low, high = np.where(first > second, when[:, 0], low), np.where(first > second, high, when[:, 1])
+    least: Float[np.ndarray, " some"] = _gap_at(low[:, None], start, move, headings, along, across)[:, 0]
+    return least

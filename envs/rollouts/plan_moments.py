@@ -141,7 +141,7 @@ def moment(
                 for branch, ((xy, _), ok) in enumerate(zip(future, counted, strict=True))
             ]
         )
-        risk[name] = _risk(planned, scene, plans)
+        risk[name] = _risk(planned, scene, plans, world.spec.dt_s)
     return PlanMoment(seed, step, crashed, np.array([ok.sum() for ok in counted]), without_m, with_m, risk)
 
 
@@ -184,9 +184,9 @@ def _error_m(
     return float(np.linalg.norm(forecast[counted] - future[counted], axis=-1).mean(axis=-1).sum())
 
 
-def _risk(planned: Forecast, scene: Scene, plans: Plans) -> Float[np.ndarray, " plans"]:
+def _risk(planned: Forecast, scene: Scene, plans: Plans, dt_s: float) -> Float[np.ndarray, " plans"]:
     """Computes the risk of each plan, as the planner does but without its margin; the first entry is no plan's."""
-    survival = contacts(planned, SceneBatch.stack([scene]), plans.size_m).survival()[0, 1:, -1]
+    survival = contacts(planned, SceneBatch.stack([scene]), plans.size_m, dt_s).survival()[0, 1:, -1]
     if plans.crashed is not None:
         survival = survival * ~plans.crashed[:, -1]
     return 1.0 - survival

@@ -34,11 +34,14 @@ def recorded_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]
     problems = _not_finite(episodes)
     if problems:  # what the next ones would find may follow from it
         return problems
+    problems = _rounded(episodes, spec)
+    if problems:
+        return problems
     problems = motion_problems(episodes, spec)
     if not problems:
         heading = heading_problems(episodes) if spec.has_ego else []
         problems = (heading + identity_problems(episodes, spec)) or misfit_problems(episodes, spec)
-    return problems + scale_problems(episodes, spec)
+    return problems + (scale_problems(episodes, spec) or _unseen(episodes, spec))
 
 
 def store_problems(episodes: Sequence[store.Episode], spec: SceneSpec) -> list[str]:
@@ -68,6 +71,40 @@ def _not_finite(episodes: Sequence[Episode]) -> list[str]:
                     f"{moment.states[wrong][0].tolist()}; leave an agent out while its state is unknown"
                 ]
     return []
+
+
+def _rounded(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
+    """Finds positions so far from the origin that 32 bits round them to more than a thousandth of their scale."""
+    axes = spec.position_dim
+    farthest_m = max(
+        (np.abs(m.states[:, :axes]).max() for e in episodes for m in e.moments if len(m.states)), default=0
+    )
+    rounded_m = float(np.spacing(np.float32(farthest_m)))
+    if rounded_m <= 1e-3 * min(spec.feature_scales[:axes]):
+        return []
+    return [
+        f"positions of up to {farthest_m:,.0f} m are recorded in steps of {rounded_m:.2g} m (float32); subtract a "
+        "fixed place of the map in read"
+    ]
+
+
+def _unseen(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
+    """Finds environments in which the ego never sees anybody, though others are there."""
+    if not spec.has_ego:
+        return []
+    axes = spec.position_dim
+    apart_m = [
+        np.linalg.norm(m.states[1:, :axes] - m.states[:1, :axes], axis=-1).min()
+        for episode in episodes
+        for m in episode.moments
+        if len(m.states) > 1
+    ]
+    if not apart_m or min(apart_m) <= spec.perception_m:
+        return []
+    return [
+        f"no other agent is ever within perception_m={spec.perception_m:g} m of the ego, the nearest is "
+        f"{min(apart_m):.0f} m away: it sees nobody; raise perception_m"
+    ]
 
 
 def observation_problems(episodes: Sequence[Episode], spaces: Mapping[str, Any]) -> list[str]:

@@ -191,10 +191,12 @@ def check_digest(path: Path, attributes: Mapping[str, Any]) -> None:
 def open_group(path: Path, mode: Literal["r", "w"], **options: Any) -> zarr.Group:
     """Opens a group; Ctrl-C and SIGTERM wait until it is open.
 
+    Zarr loses letters of the names in a relative folder whose name is short (`d`).
+
     The first group starts Zarr's event loop, which complains at its end where a signal came while it was being made.
     """
     with deferred_stops() as stops:
-        group = zarr.open_group(path, mode=mode, **options)
+        group = zarr.open_group(path.absolute(), mode=mode, **options)
     stops.stop()
     return group
 

@@ -293,6 +293,29 @@ def test_scales_travel_in_the_zip(tmp_path: Path):
     assert (extractor.config.near_m, extractor.config.far_m, extractor.config.speed_mps) == (0.1, 0.5, 1.0)
 
 
+def test_further_features_are_divided_by_their_scales(tmp_path: Path):
+    names = (*SceneSpec(dt_s=0.1).feature_names, "z_m", "load_kg")
+    spec = SceneSpec(dt_s=0.1, feature_names=names, feature_scales=(100.0, 100.0, 30.0, 30.0, 3000.0, 2.0))
+    shapes = SHAPES | {"agents": (AGENTS, 6)}
+    config = AttentionConfig.for_scenes(spec)
+    assert config == AttentionConfig(more_scales=(3000.0, 2.0))
+    scaled, plain = make_extractor(shapes, config), make_extractor(shapes)
+    observations = make_observations(shapes)
+    large = observations | {"agents": observations["agents"] * torch.tensor([1, 1, 1, 1, 3000.0, 2.0])}
+    torch.testing.assert_close(scaled(large), plain(observations), rtol=1e-5, atol=1e-5)
+    assert scaled.state_dict().keys() == plain.state_dict().keys(), "files of before can be read"
+    with pytest.raises(UserError, match=r"more_scales must be one for each of 2 further features, got \(2.0,\)"):
+        make_extractor(shapes, AttentionConfig(more_scales=(2.0,)))
+    plain_spec = SceneSpec(dt_s=0.1, feature_names=names, feature_scales=(100.0, 100.0, 30.0, 30.0, 1.0, 1.0))
+    assert AttentionConfig.for_scenes(plain_spec) == AttentionConfig()
+
+
+def test_own_observations_of_several_choices_have_a_size_that_torch_takes():
+    space = spaces.Dict({"vec": spaces.Box(-1, 1, (2,)), "pair": spaces.MultiDiscrete([3, 4])})
+    size = ForecastAttention(spaces.Dict({**space.spaces, **make_space({"valid": (AGENTS,)}).spaces})).features_dim
+    assert type(size) is int and size == 2 + 7 + 64
+
+
 def test_heads_must_divide_width():
     assert AttentionConfig(width=8, heads=4).width == 8
     with pytest.raises(UserError, match="multiple of heads"):

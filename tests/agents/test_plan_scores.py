@@ -253,3 +253,10 @@ def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extrac
     obs = venv.reset()
     assert model.predict(obs)[0].shape == (1,)
     venv.close()
+
+
+@pytest.mark.parametrize("actions", [(0, 1, -1), (0, 1, 5)])
+def test_actions_of_plans_are_actions_of_the_environment(actions: tuple[int, ...], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(plan_scores, "plan_model_for", lambda env: SimpleNamespace(actions=actions))
+    with pytest.raises(UserError, match=r"actions must be actions of Discrete\(5\), got \(0, 1, "):
+        plan_actions(Task("highway-fast-v0", "constant-velocity", what_if=True))

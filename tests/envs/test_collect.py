@@ -89,8 +89,11 @@ def test_the_store_is_the_same_for_any_number_of_workers(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2"]
 
 
-def test_a_recording_does_not_go_on_with_a_driver_that_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+@pytest.mark.parametrize(
+    ("part", "setting"), [("content_of", "content_of_drivers"), ("content_of_module", "content_of_env")]
+)
+def test_a_recording_does_not_go_on_with_a_driver_or_environment_that_has_changed(
+    part: str, setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     words = ["--env-id", TAG, "--episodes", "3", "--max-steps", "3", "--workers", "1", "--out", str(tmp_path / "store")]
     recorded = collect._record
@@ -100,13 +103,13 @@ def test_a_recording_does_not_go_on_with_a_driver_that_has_changed(
             raise KeyboardInterrupt
         return recorded(task)
 
-    monkeypatch.setattr(collect, "content_of", lambda driver: "before")
+    monkeypatch.setattr(collect, part, lambda name: "before")
     with monkeypatch.context() as stopping:
         stopping.setattr(collect, "_record", stop_at_second)
         assert run_command(collect.main, words, stopping, capsys)[0] == 130
-    monkeypatch.setattr(collect, "content_of", lambda driver: "after")
+    monkeypatch.setattr(collect, part, lambda name: "after")
     code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
-    assert code == 2 and "unfinished recording with another content_of_drivers; repeat its command" in errors[0]
+    assert code == 2 and f"unfinished recording with another {setting}; repeat its command" in errors[0]
 
 
 PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "0.3", "--causal-senders", "2"]

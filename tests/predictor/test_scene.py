@@ -322,3 +322,12 @@ def test_messages_on_many_agents_are_short():
         with pytest.raises(UserError) as caught:
             Scene(states, wrong, valid).check()
         assert len(str(caught.value)) < 400
+
+
+def test_lists_and_arrays_become_tuples():
+    names = [*KINEMATIC_FEATURES, "size_m"]
+    made = SceneSpec(0.1, ["ego", "ego"], names, np.array([1.0, 1.0, 2.0, 2.0, 3.0]), constant_features=["size_m"])
+    assert made == SceneSpec(
+        0.1, ("ego", "ego"), tuple(names), (1.0, 1.0, 2.0, 2.0, 3.0), constant_features=("size_m",)
+    )
+    assert len({made, made}) == 1

@@ -216,10 +216,15 @@ def test_keep_lane_needs_steering(discrete: gym.Env):
 
 def test_spaces_without_an_idle_or_random_action_are_named():
     env = make_env("intersection-multi-agent-v2")
-    with pytest.raises(UserError, match="no idle action is known for Tuple"):
+    with pytest.raises(
+        UserError, match="no idle action is known for Tuple.*; drive it with one of your own, own:module:function"
+    ):
         idle_action(env)
-    with pytest.raises(UserError, match="random egos need a Discrete, .* or bounded Box action space, got Tuple"):
-        make_ego_driver("random", env, np.random.default_rng(0))(None)
+    for name in ("random", "varied"):
+        with pytest.raises(
+            UserError, match="random egos need a Discrete, .* got Tuple.*; drive it with one of your own"
+        ):
+            make_ego_driver(name, env, np.random.default_rng(0))
 
 
 def test_missing_policy_is_named(tmp_path: Path, discrete: gym.Env):

@@ -113,3 +113,46 @@ def test_an_ego_alone_meets_nobody():
     found = contacts(alone, SceneBatch(scene.states[:, :1], scene.ids[:, :1], scene.valid[:, :1], scene.heading_rad))
     assert found.share.shape == (1, 1, 1, 0)
     np.testing.assert_array_equal(found.survival(), 1.0)
+
+
+@pytest.mark.parametrize("ahead_m", [60.0, 72.0, 73.0, 74.0, 79.5, 99.0])
+def test_no_head_on_crash_is_jumped_over(ahead_m: float):
+    """33 m/s against 33 m/s: 13 m from one instant to the next, of 10 m in which they touch."""
+    ego, other = [(33.0, 0.0), (66.0, 0.0)], [(ahead_m - 33.0, 0.0), (ahead_m - 66.0, 0.0)]
+    found = contacts(*meet(ego, other, (ahead_m, 0.0, -33.0, 0.0)))
+    assert found.risk()[0, 0, 0] == 1 and found.gap_m[0, 0, 0, 0] == pytest.approx(-2.0, abs=1e-4)
+    assert found.share[0, 0, 0, 0] == pytest.approx((ahead_m - 5) / 132, abs=0.11), "at the nearest instant"
+
+
+def test_the_least_gap_of_fast_agents_is_that_of_many_instants():
+    """Only theirs is searched; of slower ones, the instants are near enough."""
+    rng, searched = np.random.default_rng(0), 0
+    for _ in range(40):
+        start, end = rng.uniform(-40, 40, (2, 2))
+        forecast, scenes = meet([(0.0, 0.0)] * 2, [tuple(end)] * 2, (*start, *(end - start)))
+        x, y = (start + np.linspace(0, 1, 20_001)[:, None] * (end - start)).T
+        cos, sin = (end - start) / np.hypot(*(end - start))
+        along, across = 2.5 + 2.5 * abs(cos) + abs(sin), 1 + 2.5 * abs(sin) + abs(cos)
+        own = np.maximum(abs(x) - along, abs(y) - across)
+        turned = np.maximum(abs(x * cos + y * sin) - along, abs(y * cos - x * sin) - across)
+        least, found = np.maximum(own, turned)[1:].min(), contacts(forecast, scenes).gap_m[0, 0, 0, 0]
+        if np.hypot(*(end - start)) > 20:
+            searched += 1
+            assert found == pytest.approx(least, abs=4e-3)
+        else:
+            assert least - 1e-3 <= found <= least + 2
+    assert 20 < searched < 40
+
+
+@pytest.mark.parametrize("dt_s", [0.2, 0.1, 0.06, 0.05])
+def test_a_slow_agent_turns_whatever_the_length_of_a_step(dt_s: float):
+    """A car turns from east to north at 1.5 m/s, and passes another one, parked 1 m beside its way."""
+    times = np.arange(1, round(6 / dt_s) + 1) * dt_s
+    angle = np.minimum(times / 2, np.pi / 2)
+    ego = np.stack([3 * np.sin(angle), 3 * (1 - np.cos(angle)) + np.maximum(0, times - np.pi) * 1.5], -1)
+    xy = torch.tensor(np.stack([ego, np.tile([7.6, 7.0], (len(times), 1))])[None, None, None]).float()
+    forecast = Forecast(xy, torch.zeros(1, 2, 2, 2), torch.zeros(1, 2, 2, 1), torch.ones(1, 2).bool())
+    states = np.array([[(0.0, 0.0, 1.5, 0.0), (7.6, 7.0, 0.0, 0.0)]])
+    scenes = SceneBatch(states, np.array([[0, 1]]), np.ones((1, 2), dtype=np.bool_), np.zeros(1))
+    found = contacts(forecast, scenes, dt_s=dt_s)
+    assert found.gap_m[0, 0, 0, 0] == pytest.approx(0.9, abs=0.05) and found.risk()[0, 0, 0] == 0

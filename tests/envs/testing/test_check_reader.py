@@ -461,3 +461,19 @@ def test_actions_that_differ_most_lie_in_the_space():
     space = gym.spaces.Box(200, 250, (2,), np.uint8)
     low, middle, high = extreme_actions(space)
     assert all(space.contains(action) for action in (low, middle, high)) and middle.tolist() == [225, 225]
+
+
+def test_an_ego_that_sees_nobody_is_told():
+    near = replace(SPEC, perception_m=0.5)
+    problems = reader_problems(Crowd(), FunctionReader(read_crowd, near), episodes=2, max_steps=5)
+    (line,) = (p for p in problems if "perception_m" in p)
+    assert line.startswith("no other agent is ever within perception_m=0.5 m of the ego, the nearest is ")
+    assert reader_problems(Crowd(), FunctionReader(read_crowd, SPEC), episodes=2, max_steps=5) == []
+
+
+def test_positions_that_a_recording_would_round_are_told():
+    far = with_states(lambda states: states + np.array([500_000.0, 5_400_000.0, 0.0, 0.0]))
+    (line,) = reader_problems(Crowd(), far, episodes=2, max_steps=5)
+    assert (
+        line.startswith("positions of up to 5,400,0") and "in steps of 0.5 m (float32); subtract a fixed place" in line
+    )

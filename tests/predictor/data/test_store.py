@@ -679,3 +679,11 @@ def test_labels_of_types_that_stores_do_not_have_are_converted(name: str, kind: 
     write_store(tmp_path / "store", INFO, [replace(episode(1), **{name: labels})])
     found = getattr(read_store(tmp_path / "store").episodes[0], name)
     assert found.dtype == read and (found == 1).all()
+
+
+@pytest.mark.parametrize("name", ["d", "s", "c", "ids", "states", "data"])
+def test_a_relative_folder_with_a_short_name_is_read(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Zarr cut letters out of the names of its arrays."""
+    monkeypatch.chdir(tmp_path)
+    write_store(Path(name), INFO, [episode(1)])
+    assert_equal(read_store(Path(name)).episodes[0], episode(1))
