@@ -21,7 +21,7 @@ from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
-from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
+from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows, windows_per_forward
 from predictor.forecaster import Forecaster
 from predictor.reports.looks import STYLE
 from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
@@ -118,8 +118,9 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
     windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
     # Without training data, the spread of both baselines is fitted to the test errors, in their favour.
-    std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
-    straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
+    size = windows_per_forward(windows, chosen, config.num_samples)
+    std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon, batch_size=size))
+    straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon, batch_size=size), std_m)
     if not straight.agents:
         raise UserError(
             f"store {config.data}: in {len(chosen)} windows no agent{' but the ego' * subject.spec.has_ego} is there "
@@ -129,15 +130,15 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
     accuracies = []
     if subject.model is not None:
         made = run_windows(
-            subject.model, windows, chosen, horizon, config.num_samples, config.seed, device=config.device
+            subject.model, windows, chosen, horizon, config.num_samples, config.seed, size, config.device
         )
-        batches = track(made, "evaluate", total=-(-len(chosen) // 256))
+        batches = track(made, "evaluate", total=-(-len(chosen) // size))
         accuracies.append(summarise(subject.name, batches, subject.std_m))
     if config.num_samples == 1:
         accuracies.append(straight)
     else:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
-        made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
+        made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed, size)
         # draws hold the spread already: the density is one Gaussian around the single forecast
         drawn = summarise("constant velocity + noise", made, std_m)
         error = straight.step_errors["nll"]

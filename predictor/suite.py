@@ -367,7 +367,7 @@ def main() -> None:
     config = parse(SuiteConfig, __doc__)
     tune(config.device)
     content = run_suite(config)
-    print((config.folder / "table.md").read_text())
+    print((config.folder / "table.md").read_text(encoding="utf-8"))
     print(f"written to {config.folder}: table.md, table.json, table.tex, by_step.png")
     if content["failed"]:
         raise UserError(

@@ -79,8 +79,8 @@ class Accuracy:
     axes: int = 2
     """Number of axes of a position."""
     statistics: dict[str, Statistic] = field(default_factory=dict)
-    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and those of `OPTIONAL`
-    over all steps; without those that could not be measured."""
+    """Mean ± standard error over subsets of the windows' episodes, by name of the scalar fields above, and those of
+    `OPTIONAL` over all steps; without those that could not be measured."""
     step_errors: dict[str, list[float | None]] = field(default_factory=dict)
     """Standard error over these subsets at each step, by name of the list fields above."""
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -115,6 +115,7 @@ class Tally:
         self._shape: tuple[int, int, int] | None = None
         self._sums: dict[str, list[np.ndarray]] = {}
         self._counts: dict[str, list[np.ndarray]] = {}
+        self._episodes: list[np.ndarray | None] = []
 
     def add(self, outcome: Outcome) -> None:
         """Adds a batch of windows.
@@ -133,6 +134,7 @@ class Tally:
                 f"outcomes of one tally need the same samples, horizon and axes {self._shape}, got {shape}"
             )
         self._shape = shape
+        self._episodes.append(outcome.episode)
         for name, (value, valid) in self._measure(outcome).items():
             known, count = torch.where(valid, value, 0.0).double(), valid.double()
             if valid.ndim > 1:
@@ -147,7 +149,8 @@ class Tally:
 
         Args:
             name: the forecaster's name.
-            num_subsets: number of subsets of windows for the standard errors.
+            num_subsets: number of subsets for the standard errors: of the windows' episodes where these are known, as
+                windows of one episode overlap or are alike, else of windows.
             seed: random seed of the subsets and of the bootstrap.
             batch_intervals: whether to bootstrap over the batches, each of which must be an independent episode.
 
@@ -166,7 +169,7 @@ class Tally:
             for key in counts
             if counts[key].ndim == 2
         }
-        statistics, step_errors = _spread(sums, counts, num_subsets, seed)
+        statistics, step_errors = _spread(self._by_episode(sums), self._by_episode(counts), num_subsets, seed)
         intervals, step_intervals = self._bootstrap(seed) if batch_intervals else ({}, {})
         return Accuracy(
             name=name,
@@ -203,6 +206,18 @@ class Tally:
             intervals=intervals,
             step_intervals=step_intervals,
         )
+
+    def _by_episode(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Adds up the windows of each episode, in the order of their first windows."""
+        if any(part is None for part in self._episodes):
+            return values
+        numbers = np.concatenate([part for part in self._episodes if part is not None])
+        _, first, places = np.unique(numbers, return_index=True, return_inverse=True)
+        places = np.argsort(np.argsort(first))[places]
+        sums = {key: np.zeros((len(first), *value.shape[1:])) for key, value in values.items()}
+        for key, value in values.items():
+            np.add.at(sums[key], places, value)
+        return sums
 
     def _bootstrap(
         self, seed: int

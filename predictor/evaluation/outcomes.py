@@ -18,6 +18,9 @@ from predictor.data.windows import WindowBatch, Windows
 from predictor.forecaster import Belief, Forecaster
 from predictor.noise import Noise
 
+MOST_PAIRS = 1_000_000
+"""Largest number of pairs of agents, over windows and samples, in one forward."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -43,6 +46,8 @@ class Outcome:
     """Probability of each sample; None if the samples are draws."""
     scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
     """Standard deviation around each sample [m]; None if the forecaster has no such estimate."""
+    episode: Int[np.ndarray, " batch"] | None = None
+    """Number of each window's episode; None where it is not known."""
 
     def single(self) -> "Outcome":
         """Returns the single forecast alone: sample 0."""
@@ -175,7 +180,16 @@ def run_windows(
         batch = windows.batch(chosen).to(torch.device(device))
         if forecaster.spec.has_ego and not windows.spec.has_ego:
             batch = batch.behind_absent()
-        yield run(forecaster, batch, horizon_steps, num_samples, noise_of_windows(chosen, seed), keep_beliefs)
+        outcome = run(forecaster, batch, horizon_steps, num_samples, noise_of_windows(chosen, seed), keep_beliefs)
+        yield replace(outcome, episode=windows.index[chosen, 0])
+
+
+def windows_per_forward(windows: Windows, indices: Int[np.ndarray, " some"], samples: int) -> int:
+    """Returns the number of windows in one forward, by the largest of them, so that memory is bounded."""
+    episode, now = (torch.from_numpy(column) for column in windows.index[indices].T.copy())
+    longest = int(windows.flat.steps.max())
+    agents = int(windows.cast(episode, now, min(windows.history_steps, longest)).size.max())
+    return max(1, min(256, MOST_PAIRS // (agents**2 * samples)))
 
 
 def noise_of_windows(indices: Int[np.ndarray, " some"], seed: int) -> list[np.random.Generator]:

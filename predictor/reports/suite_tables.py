@@ -192,6 +192,8 @@ def _length(row: dict[str, Any], kind: str, view: str, name: str) -> str:
     digits = 4 if value < 0.02 else 3
     found = limits(row, "tests", kind, view, name)
     if found is not None:
+        if not all(map(math.isfinite, (value, *found))):
+            return "–"
         return f"{value:.{digits}f} ({found[0]:.{digits}f} to {found[1]:.{digits}f})"
     error = accuracy["statistics"].get(name, {}).get("standard_error")
     return _finite(value, digits) + (f" ± {error:.{digits}f}" if error is not None else "")

@@ -18,10 +18,10 @@ from torch import Tensor
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.causal_edges import with_causal_edges
 from predictor.data.device_windows import with_agents
-from predictor.data.store import Episode, EpisodeStore, read_store
+from predictor.data.store import Episode, EpisodeStore, content_id, read_store
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
-from predictor.evaluation.outcomes import run_windows
+from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.noise import NoiseOfRows, TrainingNoise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -46,8 +46,6 @@ from predictor.training.start import initial_model
 
 VALIDATION_DRAWS = 5
 """Number of samples for model selection, of models without modes."""
-VALIDATION_PAIRS = 1_000_000
-"""Largest number of pairs of agents, over windows and samples, in one forward of a validation; limits the memory."""
 LOG_EVERY = 25
 """Number of steps between two points of the training curves; on a CUDA device also between readings of results."""
 
@@ -87,6 +85,9 @@ def load_data(config: TrainConfig) -> TrainingData:
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:
         cut = len(config.data)
+        mine, theirs = ({content_id(path) for path in part} for part in (config.data, config.val_data))
+        if mine & theirs:
+            raise UserError("val_data holds a store of data, so that nothing would be held out; leave val_data out")
         chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
         train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
         val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
@@ -335,7 +336,7 @@ class Trainer:
         self.validated = self.step
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
-            self.model, w, i, self.config.horizon_steps, samples, batch_size=_per_forward(w, i, samples),
+            self.model, w, i, self.config.horizon_steps, samples, batch_size=windows_per_forward(w, i, samples),
             device=str(self.device))]  # fmt: skip
         std_m = fitted_std_m(outcomes)
         return summarise(self.config.model, outcomes), std_m if np.isfinite(std_m).all() else ()
@@ -385,10 +386,3 @@ class Trainer:
         share = max(1, self.config.val_windows // len(self.data.val))
         rng = np.random.default_rng([self.config.seed, 2])
         return [(w, rng.permutation(len(w))[:share]) for w in self.data.val]
-
-
-def _per_forward(windows: Windows, indices: np.ndarray, samples: int) -> int:
-    """Returns the number of windows in one forward of a validation, by the largest of them."""
-    episode, now = (torch.from_numpy(column) for column in windows.index[indices].T.copy())
-    agents = int(windows.cast(episode, now, windows.history_steps).size.max())
-    return max(1, min(256, VALIDATION_PAIRS // (agents**2 * samples)))

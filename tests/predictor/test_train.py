@@ -653,7 +653,9 @@ def test_the_options_that_a_message_names_continue_a_run_whose_defaults_have_cha
     tiny: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
 ):
     """Without them, the same command is another one than when the run began."""
-    began = config(circles, tmp_path / "run", input_changes=False, set=("rnn_dim=4", "head_dim=3"), val_data=(circles,))
+    held = tmp_path / "held"
+    write_store(held, StoreInfo(spec(), "circles"), [circling_episode(seed, steps=10) for seed in range(9, 12)])
+    began = config(circles, tmp_path / "run", input_changes=False, set=("rnn_dim=4", "head_dim=3"), val_data=(held,))
     train(replace(began, steps=2))
     capsys.readouterr()
     command = ["--data", str(circles), "--out", str(tmp_path / "run"), "--steps", "3", "--resume"]

@@ -126,6 +126,24 @@ def test_statistics_are_those_of_the_subsets():
             assert accuracy.step_errors[name][step] == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
 
 
+def test_windows_of_an_episode_stay_together_in_the_subsets():
+    """Copies of a window say nothing new: the standard error stays that of the episodes, in whatever order they are."""
+    once = gaussian(0, samples=4, windows=90)
+    alone = summarise("a", [replace(once, episode=np.arange(90) + 7)])
+    assert alone.statistics == summarise("a", [once]).statistics, "an episode with one window is a window"
+    copied = np.concatenate([np.arange(90), np.arange(90)[::-1]])
+    again = Outcome(once.forecast[copied], once.future[copied], once.valid[copied], episode=copied)
+    together = summarise("a", [again.last_windows(180)])
+    assert together.statistics["ade_m"].standard_error == pytest.approx(
+        alone.statistics["ade_m"].standard_error, rel=0.5
+    )
+    first_order = summarise("a", [replace(again, episode=copied), again])
+    for name, found in first_order.statistics.items():
+        assert found.standard_error == pytest.approx(together.statistics[name].standard_error, rel=1e-6), name
+    apart = summarise("a", [replace(again, episode=None)])
+    assert apart.statistics["ade_m"].standard_error < 0.85 * together.statistics["ade_m"].standard_error
+
+
 def test_rows_on_the_same_windows_have_the_same_subsets():
     first = gaussian(0, windows=60)
     shifted = replace(first, forecast=first.future[:, None] + torch.tensor([2.0, 0.0]))

@@ -15,6 +15,7 @@ from predictor.checkpoint import load_checkpoint, save_checkpoint
 from predictor.data.device_windows import window_sizes
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
+from predictor.evaluation import outcomes as outcomes_module
 from predictor.models import build, name_of
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
@@ -245,6 +246,11 @@ def test_a_checkpoint_sees_as_many_agents_as_the_largest_of_its_stores(circles: 
     assert load_data(both).spec == larger
     validated = config(circles, tmp_path, val_data=(tmp_path / "larger",))
     assert load_data(validated).spec == spec()
+
+
+def test_a_store_does_not_validate_what_it_trains(circles: Path, tmp_path: Path):
+    with pytest.raises(UserError, match="val_data holds a store of data, so that nothing would be held out"):
+        load_data(config(circles, tmp_path, val_data=(circles,)))
 
 
 def test_validation_stores_must_fit(circles: Path, tmp_path: Path):
@@ -566,7 +572,7 @@ def test_a_validation_forwards_as_many_windows_as_its_pairs_allow(
         return observe(memory, states, valid)
 
     monkeypatch.setattr(trainer.model, "observe", watched)
-    monkeypatch.setattr(trainer_module, "VALIDATION_PAIRS", 3 * agents**2 * trainer_module.VALIDATION_DRAWS)
+    monkeypatch.setattr(outcomes_module, "MOST_PAIRS", 3 * agents**2 * trainer_module.VALIDATION_DRAWS)
     parts, _ = trainer.validate()
     assert max(sizes) == 3 and parts.ade_m == pytest.approx(whole.ade_m) and parts.agents == whole.agents
 
