@@ -64,8 +64,6 @@ def settings_from_words(algorithm: Algorithm, words: Sequence[str]) -> dict[str,
             raise UserError(
                 f"--set takes NAME=VALUE with hyperparameters of {algorithm} ({', '.join(hints)}), got '{word}'"
             )
-        if name in table:
-            raise UserError(f"--set names {name} twice; leave one out")
         table[name] = _value(text, is_array=hints.get(name) == tuple[int, ...])
     return settings_from_table(algorithm, table, "--set")
 

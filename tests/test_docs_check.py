@@ -305,3 +305,21 @@ def test_a_page_of_another_folder_is_one_clear_line(
         docs_check.main()
     assert ended.value.code == 2
     assert f"error: pages must be of this repository, {tmp_path / 'page.md'} is not" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["docs/nosuch.md"], "pages must be files, "),
+        (["docs"], "pages must be files, "),
+        (["README.md", "--jobs", "0"], "--jobs must be at least 1, got 0"),
+    ],
+)
+def test_no_page_and_no_job_are_one_clear_line(
+    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(docs_check.ROOT)
+    monkeypatch.setattr(sys, "argv", ["docs_check.py", *words])
+    with pytest.raises(SystemExit) as ended:
+        docs_check.main()
+    assert ended.value.code == 2 and f"error: {message}" in capsys.readouterr().err

@@ -125,3 +125,12 @@ def test_the_command_writes_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sys, "argv", ["sbom.py", "--out", str(tmp_path / "new" / "sbom.json")])
     assert sbom.main() == 0
     assert json.loads((tmp_path / "new" / "sbom.json").read_text())["bomFormat"] == "CycloneDX"
+
+
+def test_a_bill_that_cannot_be_written_is_one_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["sbom.py", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        sbom.main()
+    assert ended.value.code == 2 and "error: --out cannot be written: " in capsys.readouterr().err

@@ -2,13 +2,16 @@ import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from stable_baselines3 import PPO
 
 from agents import evaluate
 from agents.arena import MultiagentArena
-from agents.evaluate import EvaluateConfig, checked_drivers, compared_drivers, evaluate_policy_on_seeds, main
+from agents.evaluate import EvaluateConfig, checked_drivers, compared_drivers, evaluate_policy_on_seeds, main, show
+from agents.results import Evaluation
 from agents.runs import SHIPPED
 from agents.task import EVALUATION_SEED, Task
+from agents.vec_envs import EpisodeResult
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY, policy_for, refuse
 
@@ -151,3 +154,16 @@ def test_the_policy_runs_on_the_device_that_is_asked_for(monkeypatch: pytest.Mon
 def test_no_more_episodes_are_played_than_can_be_read():
     with pytest.raises(UserError, match="episodes must be at most 10,000, got 20000"):
         EvaluateConfig(Path("run"), episodes=20_000)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_episodes_that_begin_alike_are_told(
+    alike: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("agents.evaluate.begins_alike", lambda task: alike and task == "Roundabout-v0")
+    results = {"idle": [EpisodeResult(0, 1.0, 1, None, float("nan"))] * 2}
+    show(Evaluation("envpool/Roundabout-v0", 0, results), Console(width=200))
+    said = "EnvPool's Roundabout-v0 begins every episode in the same state, so the intervals say nothing"
+    assert (said in capsys.readouterr().out) == alike
+    show(Evaluation("roundabout-v1", 0, results), Console(width=200))
+    assert said not in capsys.readouterr().out

@@ -226,3 +226,10 @@ def test_policy_of_another_algorithm_is_refused(tmp_path: Path, venv: VecEnv):
         UserError, match="model.zip is a ppo policy, where a dqn one is expected; take the file of its own run"
     ):
         load_model(tmp_path / "model.zip", "dqn")
+
+
+@pytest.mark.parametrize(("name", "option"), [("envs", "num_envs"), ("partner", "driver")])
+def test_a_resumed_run_names_the_options_of_today(name: str, option: str, tmp_path: Path):
+    open_run(tmp_path, CONFIG | {name: "old"}, MADE, resume=False)
+    with pytest.raises(UserError, match=f"cannot resume .*: {option} was 'old', now 'new'; pass the old value"):
+        open_run(tmp_path, CONFIG | {name: "new"}, MADE, resume=True)

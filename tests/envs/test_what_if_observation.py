@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from agents.features import ForecastAttention
+from envs.drivers.ego import make_ego_driver
 from envs.drivers.planner import Planner
 from envs.entries import FORECAST_KEYS, PATH_KEYS, WHAT_IF_KEYS, others_by_distance, what_if_entries
 from envs.plans import Plans
@@ -17,7 +18,7 @@ from envs.plans.contact import contacts
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.scene import SceneBatch
+from predictor.scene import Forecast, SceneBatch
 from predictor.support.errors import UserError
 from tests.envs.helpers import assert_same
 
@@ -142,3 +143,21 @@ def test_environments_without_a_plan_model_are_refused():
     env = make_env("highway-fast-v0", config={"action": {"type": "DiscreteAction"}})
     with pytest.raises(UserError, match="plans are known for DiscreteMetaAction and ContinuousAction"):
         ForecastObservation(env, "highway", what_if=True)
+
+
+def test_contacts_know_how_long_a_step_is(monkeypatch: pytest.MonkeyPatch):
+    """So that slow agents turn where steps are short: in observations and of the planner."""
+    lengths: list[float] = []
+
+    def noted(forecast: Forecast, scenes: SceneBatch, size_m: Any, dt_s: float = 1.0) -> Any:
+        lengths.append(dt_s)
+        return contacts(forecast, scenes, size_m, dt_s)
+
+    monkeypatch.setattr("envs.entries.contacts", noted)
+    monkeypatch.setattr("envs.drivers.planner.contacts", noted)
+    plain = make_env("highway-fast-v0", config={"policy_frequency": 5})
+    env = ForecastObservation(plain, "constant-velocity", what_if=True)
+    obs, _ = env.reset(seed=0)
+    assert lengths == [0.2]
+    make_ego_driver("planner:constant-velocity", env, np.random.default_rng(0))(obs)
+    assert lengths == [0.2, 0.2]

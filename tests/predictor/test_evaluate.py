@@ -16,6 +16,7 @@ from predictor import evaluate as evaluation
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
 from predictor.evaluate import EvaluateConfig, evaluate
 from predictor.evaluation.accuracy import Accuracy
@@ -348,3 +349,15 @@ def test_windows_without_a_future_are_refused(data: Path, checkpoint: Path, tmp_
 def test_longest_horizon_that_fits_is_measured(data: Path, checkpoint: Path):
     accuracies = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, num_samples=2))
     assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in accuracies)
+
+
+def test_windows_go_through_in_parts_and_change_nothing(data: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    whole = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=3))
+    sizes: list[int] = []
+    batch = Windows.batch
+    monkeypatch.setattr("predictor.evaluation.outcomes.MOST_PAIRS", 1)
+    monkeypatch.setattr(Windows, "batch", lambda self, chosen: sizes.append(len(chosen)) or batch(self, chosen))
+    parts = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=3))
+    assert set(sizes) == {1}
+    for one, other in zip(whole, parts, strict=True):
+        assert other.min_ade_m == pytest.approx(one.min_ade_m, rel=1e-5)

@@ -1,5 +1,6 @@
 """Tables of a suite, from results with known numbers."""
 
+import math
 from copy import deepcopy
 from typing import Any
 
@@ -131,3 +132,8 @@ def test_the_report_says_what_the_controls_were_fitted_to():
 def test_a_suite_whose_lines_all_failed_still_says_why():
     text = markdown_report(content([], failed={"mlp, seed 0": "no luck"}))
     assert "Failed lines: mlp, seed 0: no luck" in text and "|" not in text
+
+
+def test_seeds_whose_errors_were_not_measured_have_a_dash():
+    rows = [joined([result("model", math.nan, 0), result("model", 1.0, 1)])]
+    assert cells(grids(content(rows, seeds=2))[0], "Model")["ADE₁"] == "–"
