@@ -49,7 +49,6 @@ def test_what_is_installed_here_has_licences_and_needs():
     assert sum("licenses" in component for component in by_name.values()) > 60
 
 
-@pytest.mark.slow
 def test_each_release_of_a_package_with_several_is_a_part_and_the_installed_one_is_needed():
     pins = sbom.read_pins()
     bill = sbom.bill_of(pins, "1")
@@ -62,6 +61,7 @@ def test_each_release_of_a_package_with_several_is_a_part_and_the_installed_one_
     assert several and needed <= here
 
 
+@pytest.mark.slow
 def test_equal_pins_give_an_equal_bill():
     pins = sbom.read_pins()
     assert sbom.bill_of(pins, "1") == sbom.bill_of(pins, "1")

@@ -1,6 +1,7 @@
 """A step of a copy is one environment step, however many of its agents learn."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,3 +59,17 @@ def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
     assert [point["steps"] for point in json.loads((tmp_path / CURVE_FILE).read_text())] == [16, 32, 48, 64]
     assert sorted(set(saved)) == [0, 32]
     assert load_model(tmp_path / CHECKPOINT_FILE, algorithm).num_timesteps == 64  # type: ignore[arg-type]
+
+
+def test_progress_counts_whole_collections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A DQN that updates every 24 steps of each copy collects 48 at a time."""
+    totals, begin = list[int](), WorkShown.__init__
+
+    def note(self: WorkShown, name: str, total: int, *others: Any) -> None:
+        totals.append(total)
+        begin(self, name, total, *others)
+
+    monkeypatch.setattr(WorkShown, "__init__", note)
+    monkeypatch.setitem(PRESETS, "dqn", replace(PRESETS["dqn"], train_freq=24))
+    train(tiny(monkeypatch, ("agent_0",), "dqn"), tmp_path)
+    assert totals[0] == 96

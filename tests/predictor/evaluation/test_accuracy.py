@@ -131,6 +131,8 @@ def test_windows_of_an_episode_stay_together_in_the_subsets():
     once = gaussian(0, samples=4, windows=90)
     alone = summarise("a", [replace(once, episode=np.arange(90) + 7)])
     assert alone.statistics == summarise("a", [once]).statistics, "an episode with one window is a window"
+    numbered = np.random.default_rng(1).permutation(90)
+    assert summarise("a", [replace(once, episode=numbered)]).statistics == alone.statistics, "whatever their numbers"
     copied = np.concatenate([np.arange(90), np.arange(90)[::-1]])
     again = Outcome(once.forecast[copied], once.future[copied], once.valid[copied], episode=copied)
     together = summarise("a", [again.last_windows(180)])

@@ -126,6 +126,7 @@ def test_samples_of_a_window_do_not_depend_on_its_batch():
     forecaster, cut = model(frame=ROAD), windows()
     indices = np.arange(len(cut))
     (together,) = run_windows(forecaster, cut, indices, 3, num_samples=4, seed=5)
+    assert together.episode is not None and together.episode.tolist() == cut.index[indices, 0].tolist()
     alone = [out for i in indices for out in run_windows(forecaster, cut, indices[i : i + 1], 3, num_samples=4, seed=5)]
     for number, one in enumerate(alone):
         agents = one.forecast.shape[2]
