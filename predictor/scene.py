@@ -39,8 +39,7 @@ class SceneSpec:
     frame: tuple[AxisFrame, ...] = ("world", "world")
     """Origin that is subtracted from positions at each step, per axis: "ego" the ego's position (unbounded roads),
     "centroid" the mean of all present agents (no agent is special, the place does not matter), "world" nothing (fixed
-    maps). Recordings round positions to float32, and but for "ego" so do forecasts before they subtract it: within
-    100 km of the world's origin that is at most 4 mm."""
+    maps). Positions are float32 in recordings and, but for "ego", before that: within 100 km at most 4 mm off."""
     feature_names: tuple[str, ...] = KINEMATIC_FEATURES
     """Columns of a state; position and velocity come first, on two or three axes."""
     feature_scales: tuple[float, ...] = (100.0, 100.0, 30.0, 30.0)
@@ -56,10 +55,6 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         """Checks that the fields fit together."""
-        for name in ("frame", "feature_names", "feature_scales", "constant_features"):
-            value = getattr(self, name)
-            if isinstance(value, list | np.ndarray):
-                object.__setattr__(self, name, tuple(np.asarray(value).tolist()))
         check_types(self)
         make_plain(self)
         if not 0 < self.dt_s < float("inf"):

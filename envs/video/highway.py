@@ -298,7 +298,8 @@ def plans_shown(env: ForecastObservation) -> tuple[PlanOverlay, ...]:
     others = np.flatnonzero(scene.valid)[1:]
     now_m = scene.states[:, :2]
     futures_m = env.what_if.xy[0, :, 0].double().cpu().numpy() + now_m[0]
-    safe = contacts(env.what_if, SceneBatch.stack([scene]), plans.size_m, env.scene_spec.dt_s).survival()[0, :, -1]
+    dt_s = env.get_wrapper_attr("scene_spec").dt_s
+    safe = contacts(env.what_if, SceneBatch.stack([scene]), plans.size_m, dt_s).survival()[0, :, -1]
     if plans.crashed is not None:
         safe = safe * ~plans.crashed[:, -1]
     return tuple(

@@ -68,9 +68,11 @@ def check_types(config: Any) -> None:
 
 
 def make_plain(config: Any) -> None:
-    """Turns NumPy's numbers among the fields of a config, also within tuples, into Python's, which JSON holds."""
+    """Turns lists and arrays among the fields of a config into tuples, NumPy's numbers into Python's, as in JSON."""
     for field in fields(config):
         value = getattr(config, field.name)
+        if isinstance(value, list | np.ndarray):
+            object.__setattr__(config, field.name, value := tuple(np.asarray(value).tolist()))
         numbers = value if isinstance(value, tuple) else (value,)
         if any(isinstance(number, np.generic) for number in numbers):
             made = tuple(number.item() if isinstance(number, np.generic) else number for number in numbers)
