@@ -98,6 +98,8 @@ class ForecastAttention(BaseFeaturesExtractor):
         config: sizes and scales.
     """
 
+    more_scales: Tensor
+
     def __init__(self, observation_space: gym.Space, config: AttentionConfig | None = None) -> None:
         """Makes the layers in the sizes of the space.
 

@@ -47,7 +47,8 @@ class StepProgress(BaseCallback):
 
     def _on_training_start(self) -> None:
         done = self.model.num_timesteps
-        each = self.model.n_steps if isinstance(self.model, OnPolicyAlgorithm) else self.model.train_freq.frequency
+        on_policy = isinstance(self.model, OnPolicyAlgorithm)
+        each: int = self.model.n_steps if on_policy else self.model.train_freq.frequency  # type: ignore[attr-defined]
         rollout = each * self._num_envs
         to_come = math.ceil((self._steps - done) / rollout) * rollout
         self._shown = WorkShown("train", done + to_come, done)

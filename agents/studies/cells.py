@@ -133,7 +133,7 @@ def _content_of(forecaster: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if forecaster is None:
         return None
     name = forecaster.get("checkpoint")
-    if not is_own(name):
+    if name is None or not is_own(name):
         return {**forecaster, "checkpoint": None}
     return {**forecaster, "module": content_of(name)}
 

@@ -85,8 +85,8 @@ def load_data(config: TrainConfig) -> TrainingData:
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:
         cut = len(config.data)
-        mine, theirs = ({content_id(path) for path in part} for part in (config.data, config.val_data))
-        if mine & theirs:
+        training, held_back = ({content_id(path) for path in part} for part in (config.data, config.val_data))
+        if training & held_back:
             raise UserError("val_data holds a store of data, so that nothing would be held out; leave val_data out")
         chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
         train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
