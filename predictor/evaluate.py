@@ -1,6 +1,6 @@
 """Measures a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
-Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
+Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the episodes), miss rate, coverage,
 and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
 (K samples); writes JSON, Markdown and plots. For accuracy in live environments, run
 `python -m envs.evaluate`.

@@ -5,7 +5,7 @@ forecasts are not kept.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -169,7 +169,10 @@ class Tally:
             for key in counts
             if counts[key].ndim == 2
         }
-        statistics, step_errors = _spread(self._by_episode(sums), self._by_episode(counts), num_subsets, seed)
+        added = self._by_episode()
+        sums = {key: added(value) for key, value in sums.items()}
+        counts = {key: added(value) for key, value in counts.items()}
+        statistics, step_errors = _spread(sums, counts, num_subsets, seed, self._knows_episodes)
         intervals, step_intervals = self._bootstrap(seed) if batch_intervals else ({}, {})
         return Accuracy(
             name=name,
@@ -207,17 +210,20 @@ class Tally:
             step_intervals=step_intervals,
         )
 
-    def _by_episode(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Adds up the windows of each episode, in the order of their first windows."""
-        if any(part is None for part in self._episodes):
-            return values
+    @property
+    def _knows_episodes(self) -> bool:
+        return all(part is not None for part in self._episodes)
+
+    def _by_episode(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Returns a function that adds up the windows of each episode, in the order of their first windows."""
+        if not self._knows_episodes:
+            return lambda values: values
         numbers = np.concatenate([part for part in self._episodes if part is not None])
         _, first, places = np.unique(numbers, return_index=True, return_inverse=True)
-        places = np.argsort(np.argsort(first))[places]
-        sums = {key: np.zeros((len(first), *value.shape[1:])) for key, value in values.items()}
-        for key, value in values.items():
-            np.add.at(sums[key], places, value)
-        return sums
+        order = np.argsort(places, kind="stable")  # windows of an episode side by side
+        starts = np.searchsorted(places[order], np.arange(len(first)))
+        by_first = np.argsort(first)
+        return lambda values: np.add.reduceat(values[order], starts, axis=0)[by_first]
 
     def _bootstrap(
         self, seed: int
@@ -316,7 +322,7 @@ def _ratio(total: float, count: float) -> float:
 
 
 def _spread(
-    sums: dict[str, np.ndarray], counts: dict[str, np.ndarray], num_subsets: int, seed: int
+    sums: dict[str, np.ndarray], counts: dict[str, np.ndarray], num_subsets: int, seed: int, pooled: bool
 ) -> tuple[dict[str, Statistic], dict[str, list[float | None]]]:
     """Computes `Accuracy.statistics` and `Accuracy.step_errors` from sums and counts per window (and step)."""
     scalars: dict[str, Statistic | None] = {}
@@ -324,13 +330,14 @@ def _spread(
     for key in sums:
         root = key == "rmse_m"
         if sums[key].ndim == 1:
-            scalars[key] = ratio_statistics(sums[key], counts[key], num_subsets, seed)
+            scalars[key] = ratio_statistics(sums[key], counts[key], num_subsets, seed, pooled=pooled)
             continue
         if key in SCALAR_NAMES:
             total, count = sums[key].sum(1), counts[key].sum(1)
-            scalars[SCALAR_NAMES[key]] = ratio_statistics(total, count, num_subsets, seed, root)
+            scalars[SCALAR_NAMES[key]] = ratio_statistics(total, count, num_subsets, seed, root, pooled)
         found = [
-            ratio_statistics(s, c, num_subsets, seed, root) for s, c in zip(sums[key].T, counts[key].T, strict=True)
+            ratio_statistics(s, c, num_subsets, seed, root, pooled)
+            for s, c in zip(sums[key].T, counts[key].T, strict=True)
         ]
         step_errors[key] = [None if f is None else f.standard_error for f in found]
     return {key: value for key, value in scalars.items() if value is not None}, step_errors

@@ -50,6 +50,7 @@ def ratio_statistics(
     num_subsets: int = NUM_SUBSETS,
     seed: int = 0,
     root: bool = False,
+    pooled: bool = False,
 ) -> Statistic | None:
     """Computes Σ sums / Σ counts of each subset of windows, then mean and standard error over subsets.
 
@@ -59,6 +60,7 @@ def ratio_statistics(
         num_subsets: number of subsets, at least 1; limited to the number of windows.
         seed: random seed of the subsets.
         root: whether to take the root of each subset's ratio (squared errors become an RMSE).
+        pooled: whether the mean is over all entries instead: that of subsets with few entries would count as much.
 
     Returns:
         Mean and standard error, or None if nothing is valid.
@@ -68,7 +70,9 @@ def ratio_statistics(
     if not len(values):
         return None
     error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
-    return Statistic(float(values.mean()), error, len(values))
+    whole = sums.sum() / counts.sum()
+    mean = values.mean() if not pooled else np.sqrt(whole) if root else whole
+    return Statistic(float(mean), error, len(values))
 
 
 def batch_interval(

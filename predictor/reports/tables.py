@@ -199,7 +199,7 @@ def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> F
         lines.append([one.name, str(one.num_samples), *scalars, f"{one.agents}", *cells])
     caption = (
         "by time ahead: displacement of the best sample [m] / RMSE of the mean [m] / NLL [nats], top to bottom; "
-        f"± standard error over subsets of the windows; missed: final displacement above "
+        f"± standard error over subsets of the episodes; missed: final displacement above "
         f"{accuracies[0].miss_threshold_m:g} m; "
         f"ADE₁, FDE₁: single forecast; energy: energy score, lower is better; "
         f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples; "

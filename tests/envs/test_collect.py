@@ -1,4 +1,5 @@
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,14 @@ def test_a_recording_does_not_go_on_with_a_driver_or_environment_that_has_change
     monkeypatch.setattr(collect, part, lambda name: "after")
     code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
     assert code == 2 and f"unfinished recording with another {setting}; repeat its command" in errors[0]
+
+
+def test_what_the_reader_says_of_its_scenes_is_a_setting_of_a_recording():
+    made = config(env_id=TAG, out=Path("store"))
+    info = collect._info(made, 0)
+    other = replace(info, spec=replace(info.spec, dt_s=2 * info.spec.dt_s))
+    before, after = (collect._settings(made, one) for one in (info, other))
+    assert {name for name in before if before[name] != after[name]} == {"spec"}
 
 
 PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "0.3", "--causal-senders", "2"]
