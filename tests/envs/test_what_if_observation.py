@@ -2,6 +2,7 @@
 
 import pickle
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,8 @@ from envs.entries import FORECAST_KEYS, PATH_KEYS, WHAT_IF_KEYS, others_by_dista
 from envs.plans import Plans
 from envs.plans.contact import contacts
 from envs.registry import make_env
+from envs.rollouts import plan_moments
+from envs.video.highway import plans_shown
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import Forecast, SceneBatch
@@ -146,18 +149,22 @@ def test_environments_without_a_plan_model_are_refused():
 
 
 def test_contacts_know_how_long_a_step_is(monkeypatch: pytest.MonkeyPatch):
-    """So that slow agents turn where steps are short: in observations and of the planner."""
+    """So that slow agents turn where steps are short: in observations, of the planner, in films and measures."""
     lengths: list[float] = []
 
     def noted(forecast: Forecast, scenes: SceneBatch, size_m: Any, dt_s: float = 1.0) -> Any:
         lengths.append(dt_s)
         return contacts(forecast, scenes, size_m, dt_s)
 
-    monkeypatch.setattr("envs.entries.contacts", noted)
-    monkeypatch.setattr("envs.drivers.planner.contacts", noted)
+    for module in ("envs.entries", "envs.drivers.planner", "envs.video.highway", "envs.rollouts.plan_moments"):
+        monkeypatch.setattr(f"{module}.contacts", noted)
     plain = make_env("highway-fast-v0", config={"policy_frequency": 5})
     env = ForecastObservation(plain, "constant-velocity", what_if=True)
     obs, _ = env.reset(seed=0)
     assert lengths == [0.2]
     make_ego_driver("planner:constant-velocity", env, np.random.default_rng(0))(obs)
     assert lengths == [0.2, 0.2]
+    assert env.plans is not None and env.what_if is not None
+    assert len(plans_shown(env)) == env.what_if.num_plans and lengths == [0.2] * 3
+    plan_moments._risk(env.what_if, env.scene, replace(env.plans, crashed=None), 0.3)
+    assert lengths[3:] == [0.3]
