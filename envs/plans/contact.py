@@ -2,10 +2,11 @@
 
 Every agent is a rectangle along its direction of motion, all of one size. Between two steps agents move straight,
 and are compared at several instants; where they move so fast that two instants could lie before and after a contact,
-the least gap between these is searched. The gap of two rectangles is the largest separation along an axis of one of
+the least gap of the whole step is taken. The gap of two rectangles is the largest separation along an axis of one of
 them: at most their distance, and negative exactly where they overlap.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,6 @@ from predictor.scene import Forecast, SceneBatch
 
 INSTANTS = 5
 """Number of instants at which agents are compared in each step."""
-SEARCHES = 48
-"""Number of rounds of a search for the least gap, each of which leaves two thirds: at last 4e-9 of a step."""
 LEAST_SPEED_MPS = 0.1
 """Lowest speed that has a direction [m/s]; slower agents keep their heading."""
 FAR_M = 1000.0
@@ -77,8 +76,9 @@ def contacts(
     heading_rad[:, 0] = np.where(slow[:, 0], scenes.heading_rad, heading_rad[:, 0])
     headings = _headings(path, np.broadcast_to(heading_rad[:, None, None], xy.shape[:4]), LEAST_SPEED_MPS * dt_s)
     sizes = np.broadcast_to(np.asarray(size_m, np.float64), (batch, 2)).T.reshape(2, batch, 1, 1, 1, 1)
-    gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], sizes)
-    gap = np.where(scenes.valid[:, None, None, 1:, None, None], gap, FAR_M).clip(max=FAR_M)
+    there = scenes.valid[:, None, None, 1:, None]
+    gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], sizes, there)
+    gap = np.where(there[..., None], gap, FAR_M).clip(max=FAR_M)
     touching = ~(gap > 0)  # what is not a number counts as a contact, not as a free way
     touched = touching.reshape(batch, plans, samples, agents - 1, horizon * INSTANTS)
     ever = touched.any(-1)
@@ -109,69 +109,68 @@ def _gaps(
     ego_rad: Float[np.ndarray, "*#batch steps"],
     others_rad: Float[np.ndarray, "*batch steps"],
     size_m: Float[np.ndarray, "2 ..."],
+    there: Bool[np.ndarray, "..."],
 ) -> Float[np.ndarray, "*batch steps instants"]:
     """Computes the gap of two rectangles at the instants of each step [m].
 
     The instant with the smallest gap has the least one of its step where agents move more than twice the smaller side
-    against each other from one instant to the next. That is exact, as the gap of a step is a convex function of time.
+    against each other from one instant to the next.
     """
     between, (length_m, width_m) = others - ego, size_m
     start, move = between[..., :-1, :], np.diff(between, axis=-2)
+    when = np.arange(1, INSTANTS + 1)[:, None] / INSTANTS
+    offset = start[..., None, :] + when * move[..., None, :]
     cos, sin = np.abs(np.cos(others_rad - ego_rad)), np.abs(np.sin(others_rad - ego_rad))
-    along, across = (length_m + length_m * cos + width_m * sin) / 2, (width_m + length_m * sin + width_m * cos) / 2
-    headings = np.stack(np.broadcast_arrays(ego_rad, others_rad), -1)
-    when = np.arange(1, INSTANTS + 1) / INSTANTS
-    gap = _gap_at(when, start, move, headings, along, across)
-    fast = np.hypot(move[..., 0], move[..., 1]) > 2 * INSTANTS * np.minimum(length_m, width_m)
+    reach_along = (length_m + length_m * cos + width_m * sin) / 2
+    reach_across = (width_m + length_m * sin + width_m * cos) / 2
+    gap = np.full(offset.shape[:-1], -np.inf)
+    for heading in (ego_rad, others_rad):
+        along, across = np.cos(heading)[..., None], np.sin(heading)[..., None]
+        x, y = offset[..., 0], offset[..., 1]
+        gap = np.maximum(gap, np.abs(x * along + y * across) - reach_along[..., None])
+        gap = np.maximum(gap, np.abs(y * along - x * across) - reach_across[..., None])
+    fast = (np.hypot(move[..., 0], move[..., 1]) > 2 * INSTANTS * np.minimum(length_m, width_m)) & there
     if fast.any():
-        found, rows = gap[fast], np.arange(fast.sum())
+        ego_rad = np.broadcast_to(ego_rad, fast.shape)
+        reaches = (reach_along[fast], reach_across[fast])
+        least = _least_gap(start[fast], move[fast], (ego_rad[fast], others_rad[fast]), reaches)
+        found, rows = gap[fast], np.arange(len(least))
         nearest = found.argmin(-1)
-        least = _least_gap(start[fast], move[fast], headings[fast], along[fast], across[fast])
         found[rows, nearest] = np.minimum(found[rows, nearest], least)
         gap[fast] = found
-    return gap
-
-
-def _gap_at(
-    when: Float[np.ndarray, "*#batch instants"],
-    start: Float[np.ndarray, "*batch 2"],
-    move: Float[np.ndarray, "*batch 2"],
-    headings: Float[np.ndarray, "*batch 2"],
-    along: Float[np.ndarray, "*batch"],
-    across: Float[np.ndarray, "*batch"],
-) -> Float[np.ndarray, "*batch instants"]:
-    """Computes the gap at instants of a step, which are shares of it [m].
-
-    Args:
-        when: the instants.
-        start: offset of the other's centre from the ego's at the step's beginning [m].
-        move: change of the offset in the step [m].
-        headings: direction of the ego and of the other [rad].
-        along: half the reach of both along a heading [m].
-        across: half the reach of both across a heading [m].
-    """
-    x, y = (start[..., axis, None] + when * move[..., axis, None] for axis in (0, 1))
-    gap = np.full(x.shape, -np.inf)
-    for who in (0, 1):
-        cos, sin = np.cos(headings[..., who, None]), np.sin(headings[..., who, None])
-        gap = np.maximum(gap, np.abs(x * cos + y * sin) - along[..., None])
-        gap = np.maximum(gap, np.abs(y * cos - x * sin) - across[..., None])
     return gap
 
 
 def _least_gap(
     start: Float[np.ndarray, "some 2"],
     move: Float[np.ndarray, "some 2"],
-    headings: Float[np.ndarray, "some 2"],
-    along: Float[np.ndarray, " some"],
-    across: Float[np.ndarray, " some"],
+    headings_rad: Sequence[Float[np.ndarray, " some"]],
+    reaches_m: Sequence[Float[np.ndarray, " some"]],
 ) -> Float[np.ndarray, " some"]:
-    """Computes the least gap within a step by ternary search, the arguments as those of `_gap_at` [m]."""
-    low, high = np.zeros(len(start)), np.ones(len(start))
-    for _ in range(SEARCHES):
-        third = (high - low) / 3
-        when = np.stack([low + third, high - third], -1)
-        first, second = _gap_at(when, start, move, headings, along, across).T
-        low, high = np.where(first > second, when[:, 0], low), np.where(first > second, high, when[:, 1])
-    least: Float[np.ndarray, " some"] = _gap_at(low[:, None], start, move, headings, along, across)[:, 0]
+    """Computes the least gap within a step, exactly [m].
+
+    As a function of time the gap is the largest of eight straight lines: the separation along each of four axes, in
+    both directions. So it is least at an end of the step or where two of them cross.
+
+    Args:
+        start: offset of the other's centre from the ego's at the step's beginning [m].
+        move: change of the offset in the step [m].
+        headings_rad: direction of the ego and of the other.
+        reaches_m: half of what both reach along and across a heading.
+    """
+    values, slopes = [], []
+    for heading in headings_rad:
+        cos, sin = np.cos(heading), np.sin(heading)
+        for x, y, reach in ((cos, sin, reaches_m[0]), (-sin, cos, reaches_m[1])):
+            value, slope = x * start[:, 0] + y * start[:, 1], x * move[:, 0] + y * move[:, 1]
+            values += [value - reach, -value - reach]
+            slopes += [slope, -slope]
+    value, slope = np.stack(values, -1), np.stack(slopes, -1)
+    one, other = np.triu_indices(value.shape[1], k=1)
+    faster = slope[:, one] - slope[:, other]
+    behind = value[:, other] - value[:, one]
+    crossings = np.divide(behind, faster, out=np.zeros_like(behind), where=faster != 0).clip(0.0, 1.0)
+    when = np.concatenate([crossings, np.ones((len(value), 1))], -1)  # parallel lines give the beginning
+    gaps: Float[np.ndarray, "some times"] = (value[:, None] + when[..., None] * slope[:, None]).max(-1)
+    least: Float[np.ndarray, " some"] = gaps.min(-1)
     return least
