@@ -5,6 +5,7 @@ one training with its test episodes, in a process of its own. The same command c
 never runs a finished cell again. The folder then holds report.html, report.md, episodes.parquet and curves.parquet.
 """
 
+import itertools
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -56,6 +57,8 @@ class StudyConfig:
     headroom: bool = False
     """Run the arms of no and of perfect foresight alone, beside constant actions and planner: is there anything to
     gain? Writes headroom.md."""
+    report: bool = False
+    """Write tables and report of all results that the folder has, those of earlier versions too, and run nothing."""
     list: bool = False
     """Print the studies that ship, and run nothing."""
 
@@ -65,6 +68,8 @@ class StudyConfig:
         check_at_least(self, 1, "seeds")
         check_processes(self.workers, "workers")
         check_address(self.cluster)
+        if self.report and (self.scenarios or self.seeds is not None or self.cluster is not None):
+            raise UserError("--report takes all results in the folder; leave out --scenarios, --seeds and --cluster")
 
     @property
     def num_processes(self) -> int:
@@ -86,13 +91,14 @@ def run_study(config: StudyConfig) -> int:
     folder = config.out or Path("runs") / f"study-{study.name}"
     check_out(folder)
     _check_folder(folder)
+    if config.report:
+        return _report_only(config, folder, study, text)
     cells = cells_of(study, file.name)
     chosen = _chosen(config, study, cells)
     with locked(folder, "study"):
         delete_leftovers(folder)
         results = _results_of(folder, cells)
-        _keep_earlier(folder, text)
-        write_text(folder / STUDY_FILE, text)
+        _keep_file(folder, text)
         failed = _run_missing(config, folder, chosen, results, len(cells))
         done = [results[cell.name] for cell in cells if cell.name in results]
         _write(config, folder, study, done, text, [cell for cell, _ in failed], len(cells))
@@ -141,12 +147,13 @@ def _check_folder(folder: Path) -> None:
             raise UserError(f"{folder} holds {found[0]} but no study ({STUDY_FILE}); choose another --out")
 
 
-def _keep_earlier(folder: Path, text: str) -> None:
-    """Keeps the file of an earlier run of the folder, if it was another one, and says so."""
+def _keep_file(folder: Path, text: str) -> None:
+    """Writes the study's file into the folder; the file of an earlier run is kept if it was another one."""
     earlier = folder / STUDY_FILE
     if earlier.exists() and (before := earlier.read_text(encoding="utf-8")) != text:
         write_text(folder / EARLIER_FILE, before)
         print(f"{earlier} was of another study or an earlier version; kept as {EARLIER_FILE}", file=sys.stderr)
+    write_text(earlier, text)
 
 
 def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:
@@ -157,6 +164,40 @@ def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:
     """
     files = {cell.name: folder / CELLS / cell.name / RESULT_FILE for cell in cells}
     return {name: read_result(file) for name, file in files.items() if file.exists()}
+
+
+def _report_only(config: StudyConfig, folder: Path, study: Study, text: str) -> int:
+    """Writes tables and report of all results in the folder; returns the exit status.
+
+    Raises:
+        UserError: there is none, or one is damaged.
+    """
+    results = _all_results(folder, study)
+    if not results:
+        raise UserError(f"{folder} holds no result of this study ({CELLS}/NAME/{RESULT_FILE}); run it without --report")
+    with locked(folder, "study"):
+        _keep_file(folder, text)
+        trained = sum(result.algorithm is not None for result in results)
+        to_train = len(study.scenarios) * len(study.arms) * len(study.algorithms) * len(study.training_seeds)
+        _write(config, folder, study, results, text, (), len(results) - trained + to_train)
+    return 0
+
+
+def _all_results(folder: Path, study: Study) -> list[Result]:
+    """Reads the results of a study's scenarios and arms, whatever version they are of; of two of one cell the later.
+
+    Raises:
+        UserError: one of them is damaged.
+    """
+    found = [read_result(file) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
+    latest = {
+        (each.scenario, each.arm, each.algorithm, each.seed): each
+        for each in sorted(found, key=lambda each: str(each.provenance.get("time")))
+    }
+    drivers = list(dict.fromkeys((each.arm, None, None) for each in found if each.algorithm is None))
+    arms = list(itertools.product([arm.name for arm in study.arms], study.algorithms, study.training_seeds))
+    cells = ((scenario.name, *line) for scenario in study.scenarios for line in (*drivers, *arms))
+    return [latest[cell] for cell in cells if cell in latest]
 
 
 def _run_missing(

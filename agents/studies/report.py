@@ -1,5 +1,6 @@
 """Report of a study: tables, pictures and provenance, as Markdown and as one HTML page."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def write_headroom(folder: Path, findings: Findings, provenance: dict[str, Any])
         Heading(f"Headroom: {title_of(findings)}", 1),
         *_headroom(findings),
         *_times(findings),
-        *_provenance(provenance, ""),
+        *_provenance(findings, provenance, ""),
     ]
     written = as_markdown(blocks)
     write_text(folder / HEADROOM, written)
@@ -76,7 +77,7 @@ def blocks_of(
         blocks += _all_scenarios(findings)
     if findings.lines(trained=True):
         blocks += _pictures(findings)
-    return [*blocks, *_loop_errors(findings), *_times(findings), *_provenance(provenance, text)]
+    return [*blocks, *_loop_errors(findings), *_times(findings), *_provenance(findings, provenance, text)]
 
 
 def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
@@ -270,10 +271,13 @@ def _times(findings: Findings) -> list[Block]:
     return [Heading("Time"), Paragraph(told), Table(headings, lines)]
 
 
-def _provenance(provenance: dict[str, Any], text: str) -> list[Block]:
+def _provenance(findings: Findings, provenance: dict[str, Any], text: str) -> list[Block]:
     versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
     told = f"{provenance['command']}; commit {provenance['commit']}; {provenance['machine']}; {provenance['time']}."
+    commits = Counter(str(each.provenance.get("commit")) for runs in findings.results.values() for each in runs)
+    counted = ", ".join(f"{count} of {commit}" for commit, count in commits.items())
     blocks: list[Block] = [Heading("Provenance"), Paragraph(told), Paragraph(f"Versions: {versions}.")]
+    blocks.append(Paragraph(f"Commits of the results: {counted}."))
     return [*blocks, Code(text, "toml")] if text else blocks
 
 

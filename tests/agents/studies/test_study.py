@@ -18,10 +18,11 @@ import pytest
 
 import agents.study
 from agents.studies.pool import run_cells
+from agents.studies.results import write_result
 from agents.study import StudyConfig, run_study
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.jobs import SERVED
-from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, study_path, study_text
+from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, result, study_path, study_text
 
 LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
 """What differs between two runs of one study."""
@@ -294,6 +295,44 @@ def test_a_folder_with_something_else_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match=r"out holds thesis.tex but no study \(study.toml\); choose another --out"):
         run_study(config(tmp_path, study_text()))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = replace(config(tmp_path, study_text(seeds="3", env_id="nowhere:Gone-v0")), report=True)
+    monkeypatch.setattr("agents.study.run_cells", lambda *_: pytest.fail("nothing is run"))
+    with pytest.raises(UserError, match=r"out holds no result of this study \(cells/NAME/result.json\); run it"):
+        run_study(run)
+    made = [
+        result("none", [2.0, 2.0], seed=1, scenario="corridor", provenance={"commit": "new", "time": "2026-02"}),
+        result("none", [9.0, 9.0], seed=1, scenario="corridor", provenance={"commit": "old", "time": "2026-01"}),
+        result("none", [4.0, 4.0], seed=0, scenario="corridor", provenance={"commit": "old", "time": "2026-01"}),
+        result("none", [70.0], seed=3, scenario="corridor"),
+        result("zeros", [80.0], seed=0, scenario="corridor"),
+        result("none", [90.0], seed=0, scenario="elsewhere"),
+        result("random", [1.0, 1.0], scenario="corridor", provenance={"commit": "old", "time": "2026-01"}),
+    ]
+    for i, each in enumerate(made):
+        folder = tmp_path / "out" / "cells" / f"of-another-version-{i}"
+        folder.mkdir(parents=True)
+        write_result(folder / "result.json", each)
+    (tmp_path / "out" / "study.toml").write_text("")
+    assert run_study(run) == 0
+    episodes = parquet.read_table(tmp_path / "out" / "episodes.parquet").to_pylist()
+    assert [(e["arm"], e["seed"], e["return"]) for e in episodes] == [
+        ("random", None, 1.0), ("random", None, 1.0), ("none", 0, 4.0), ("none", 0, 4.0), ("none", 1, 2.0),
+        ("none", 1, 2.0),
+    ]  # fmt: skip
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "Not run yet: 1 cells" in report and "Commits of the results: 2 of old, 1 of new." in report
+    assert "study.before.toml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("other", [{"scenarios": ("corridor",)}, {"seeds": 1}, {"cluster": "auto"}])
+def test_the_report_alone_is_of_everything(other: dict[str, Any]):
+    with pytest.raises(UserError, match="leave out --scenarios, --seeds and --cluster"):
+        StudyConfig(report=True, **other)
 
 
 @pytest.mark.slow
