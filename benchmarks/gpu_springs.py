@@ -37,7 +37,8 @@ from predictor.support.runtime import processor, resolve_device, tune
 from predictor.training.batches import Shapes
 from predictor.training.config import TrainConfig, TrainPrecision
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 
 SPLITS = ("train", "val", "test", "ood")
 LINE = next(line for line in SPRINGS.lines if line.key == "dgvae")

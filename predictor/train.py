@@ -38,7 +38,8 @@ from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import TrainConfig
 from predictor.training.curve import CURVE_FILE, KEYS, add_point
 from predictor.training.processes import ALONE, Group, LostProcessError, joined
-from predictor.training.trainer import LOG_EVERY, Trainer, load_data
+from predictor.training.trainer import LOG_EVERY, Trainer
+from predictor.training.training_data import load_data
 
 STATE_FILE = "train_state.pt"
 

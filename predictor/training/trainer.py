@@ -5,8 +5,8 @@ that was not.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,12 @@ import torch
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.data.causal_edges import with_causal_edges
-from predictor.data.device_windows import with_agents
-from predictor.data.store import Episode, EpisodeStore, content_id, read_store
-from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
+from predictor.data.windows import WindowBatch, Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.noise import NoiseOfRows, TrainingNoise
-from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.support.files import new_file
-from predictor.support.remote import address
 from predictor.support.runtime import precision, tensor_cores
 from predictor.training.batches import Plan, open_batches, plan
 from predictor.training.config import TrainConfig
@@ -43,102 +38,12 @@ from predictor.training.processes import ALONE, Group, keep_rows_of_dropout
 from predictor.training.saved_state import read_state
 from predictor.training.shift_loss import Shifts
 from predictor.training.start import initial_model
+from predictor.training.training_data import TrainingData
 
 VALIDATION_DRAWS = 5
 """Number of samples for model selection, of models without modes."""
 LOG_EVERY = 25
 """Number of steps between two points of the training curves; on a CUDA device also between readings of results."""
-
-
-@dataclass(frozen=True)
-class TrainingData:
-    """Keeps windows of all stores, split by episode."""
-
-    spec: SceneSpec
-    """Layout of the first store's scenes; the others are compatible."""
-    sources: tuple[str, ...]
-    """Source of each store's recordings."""
-    train: list[Windows]
-    """Training windows of each store."""
-    val: list[Windows]
-    """Windows of each store for model selection."""
-    train_episodes: list[Episode]
-    """All training episodes."""
-
-
-def load_data(config: TrainConfig) -> TrainingData:
-    """Reads and splits the stores.
-
-    Raises:
-        UserError: stores differ in features or dt, or have too few episodes.
-    """
-    stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
-    if config.causal_edges:
-        if all(store.info.causal_threshold_m is None for store in stores[: len(config.data)]):
-            raise UserError("causal_edges needs a store with causal labels, got none; collect one with --branches 4")
-        stores = [with_causal_edges(store) for store in stores]
-    spec = stores[0].info.spec
-    for path, store in zip((*config.data, *config.val_data), stores, strict=True):
-        spec.check_recorded(store.info.spec, f"store {address(config.data[0])}", f"store {address(path)}")
-    spec = replace(spec, max_agents=max(store.info.spec.max_agents for store in stores[: len(config.data)]))
-    _check_labels(config, stores)
-    sources = tuple(s.info.source for s in stores[: len(config.data)])
-    if config.val_data:
-        cut = len(config.data)
-        training, held_back = ({content_id(path) for path in part} for part in (config.data, config.val_data))
-        if training & held_back:
-            raise UserError("val_data holds a store of data, so that nothing would be held out; leave val_data out")
-        chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
-        train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
-        val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
-        return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part])
-    train, val, episodes, splits = [], [], [], []
-    for store in stores:
-        group = siblings(store.episodes)
-        parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
-        splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
-    # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
-    held = [{_played(store, i) for i in held_out} for store, (_, held_out) in zip(stores, splits, strict=True)]
-    for path, store, mine, (kept, held_out) in zip(config.data, stores, held, splits, strict=True):
-        elsewhere = set[Any]().union(*held) - mine - {None}
-        kept = [i for i in kept if _played(store, i) not in elsewhere][: config.max_episodes or None]
-        if not kept or not held_out:
-            raise UserError(
-                f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
-                f"{len(held_out)} for validation; both need at least one, so collect more"
-            )
-        chosen_here = [store.episodes[i] for i in kept]
-        train.append(_windows(config, chosen_here, spec, validation=False))
-        val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
-        episodes += chosen_here
-    return TrainingData(spec, sources, train, val, episodes)
-
-
-def _played(store: EpisodeStore, number: int) -> tuple[str, int, str] | None:
-    """Returns which episode of which environment it is, as are its branches; None where seeds only number episodes."""
-    episode = store.episodes[number]
-    return (store.info.source, episode.seed, episode.label) if "seed" in store.info.provenance else None
-
-
-def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
-    """Checks that every training store has the labels for which the config has a weight."""
-    for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
-        for path, store in zip(config.data, stores, strict=False):
-            if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
-                raise UserError(
-                    f"{option} needs {name}, and store {address(path)} has none; set it to 0 or use labelled data"
-                )
-    kinds = {store.info.edge_attribute_names: address(path) for path, store in zip(config.data, stores, strict=False)}
-    if config.label_weight and len(kinds) > 1:
-        listed = ", ".join(f"{path} has {', '.join(names) or 'ones without names'}" for names, path in kinds.items())
-        raise UserError(f"label_weight needs the same edge attributes in every store, but {listed}; train on one kind")
-
-
-def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
-    whole = validation and config.val_history_steps > 1  # as in the tables: whole burn-in, whole horizon
-    future, history = (config.horizon_steps, config.val_history_steps) if whole else (1, 1)
-    windows = Windows(episodes, spec, config.history_steps, config.horizon_steps, future, history)
-    return windows if validation else with_agents(windows)
 
 
 class Trainer:
@@ -173,7 +78,7 @@ class Trainer:
             self._drawn = NoiseOfRows(self.noise, rows, config.batch_size)
             keep_rows_of_dropout(self.model, rows, config.batch_size)
         source = open_batches(config, data.train, self.device, self.model.config, rows)
-        self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
+        self.batches, self.notes, self._widths = source.batches, (*data.notes, *source.notes), source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda
         self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None

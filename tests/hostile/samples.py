@@ -34,7 +34,8 @@ from predictor.support.files import write_json
 from predictor.train import _check_run_folder, _comparable
 from predictor.training.config import TrainConfig
 from predictor.training.curve import read_curve as errors_of
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 from tests.hostile import texts
 from tests.predictor.helpers import PLURAL, model, spec, write_circles
 

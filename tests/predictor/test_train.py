@@ -32,7 +32,8 @@ from predictor.train import train
 from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change
 from predictor.training.objective import window_loss
-from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data
+from predictor.training.trainer import VALIDATION_DRAWS, Trainer
+from predictor.training.training_data import load_data
 from tests.predictor.data.test_twins import twins_of
 from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, following_episode, model, spec, write_circles
 
@@ -763,7 +764,7 @@ def test_non_finite_states_in_the_store(
 def test_stores_of_different_time_steps_do_not_mix(circles: Path, tmp_path: Path):
     write_store(tmp_path / "quick", StoreInfo(spec(dt_s=0.2), "quick"), read_store(circles).episodes)
     settings = replace(config(circles, tmp_path / "run"), data=(circles, tmp_path / "quick"))
-    with pytest.raises(UserError, match=r"store .*circles was trained at dt_s=1 but store .*quick steps at dt_s=0\.2"):
+    with pytest.raises(UserError, match=r"the same dt_s, but .*circles has 1\.0 and .*quick has 0\.2; train on"):
         load_data(settings)
 
 

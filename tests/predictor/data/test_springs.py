@@ -26,7 +26,8 @@ from predictor.data.springs import (
 from predictor.data.store import PERTURBATIONS, read_store
 from predictor.support.errors import UserError, run_entry_point
 from predictor.training.config import TrainConfig
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 from tests.predictor.data.helpers import energy
 
 OPEN = Physics(num_agents=2, box_m=1e6, dt_s=0.1, frames=61, substeps=50)  # no walls

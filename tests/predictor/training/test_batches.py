@@ -28,7 +28,8 @@ from predictor.training.batches import (
     plan,
 )
 from predictor.training.config import TrainConfig
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 from tests.predictor.helpers import FAST_LIKE, circling_episode, spec, write_circles
 
 CPU = torch.device("cpu")

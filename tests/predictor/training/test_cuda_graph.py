@@ -17,7 +17,8 @@ from predictor.training.batches import HostBatches, PrefetchedBatches, Shapes
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import CapturedStep, NotCapturableError, default_generator, signature
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 
 SCHEDULES: dict[str, Any] = {
     "min_history_steps": 1,

@@ -12,7 +12,8 @@ from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.forecaster import Futures
 from predictor.scene import SceneSpec
 from predictor.training.config import TrainConfig
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 
 BEFORE, AFTER, AGENTS, MODES = 3, 4, 3, 20
 SPEC = SceneSpec(dt_s=1.0, feature_scales=(30.0, 30.0, 5.0, 5.0), has_ego=False, max_agents=AGENTS)

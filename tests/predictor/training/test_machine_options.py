@@ -19,7 +19,8 @@ from predictor.train import train
 from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 
 pytestmark = pytest.mark.usefixtures("tiny")
 

@@ -28,7 +28,8 @@ from predictor.train import train
 from predictor.training import processes
 from predictor.training.config import TrainConfig
 from predictor.training.processes import ALONE, Group, LostProcessError, RowsDropout, joined, keep_rows_of_dropout
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, spec
 
 ROOT = Path(__file__).parents[3]

@@ -13,7 +13,8 @@ from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from predictor.training.rescaling import rescaled
-from predictor.training.trainer import Trainer, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import load_data
 from tests.predictor.helpers import any_model, circling_episode, random_states, spec
 
 SCALES = {

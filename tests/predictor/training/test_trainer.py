@@ -17,7 +17,7 @@ from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
 from predictor.evaluation import outcomes as outcomes_module
 from predictor.models import build, name_of
-from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import fitted_scales
@@ -26,7 +26,8 @@ from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
 from predictor.training.start import model_config
-from predictor.training.trainer import Trainer, TrainingData, load_data
+from predictor.training.trainer import Trainer
+from predictor.training.training_data import TrainingData, load_data
 from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
 
 SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
@@ -253,9 +254,50 @@ def test_a_store_does_not_validate_what_it_trains(circles: Path, tmp_path: Path)
         load_data(config(circles, tmp_path, val_data=(circles,)))
 
 
+def test_no_episode_of_a_store_validates_what_another_trains(circles: Path, tmp_path: Path):
+    """Stores of one environment and of overlapping seeds hold the same episodes, though their contents differ."""
+    recorded = StoreInfo(spec(), "env", {"seed": 0})
+    write_store(tmp_path / "train", recorded, [circling_episode(i) for i in range(6)])
+    write_store(tmp_path / "other", recorded, [circling_episode(i, steps=7) for i in range(6, 9)])
+    write_store(tmp_path / "val", recorded, [circling_episode(i, steps=7) for i in range(4, 9)])
+    write_store(tmp_path / "elsewhere", replace(recorded, source="another"), [circling_episode(0)])
+    begun = replace(config(circles, tmp_path), data=(circles, tmp_path / "train"))
+    said = r"val \(val_data\) plays 2 of the episodes of .*train: the same environment and seeds, such as 4; collect it"
+    with pytest.raises(UserError, match=said):
+        load_data(replace(begun, val_data=(tmp_path / "elsewhere", tmp_path / "val")))
+    data = load_data(replace(begun, val_data=(tmp_path / "elsewhere", tmp_path / "other")))
+    assert len(data.val) == 2 and len(data.train_episodes) == 12
+
+
+def test_stores_that_differ_in_frame_or_range_are_named(circles: Path, tmp_path: Path):
+    near = replace(spec(), perception_m=7.5)
+    write_store(tmp_path / "near", StoreInfo(near, "near"), [circling_episode(i) for i in range(6)])
+    both = replace(config(circles, tmp_path), data=(tmp_path / "near", circles))
+    (note,) = Trainer(both, load_data(both)).notes
+    assert note.startswith("perception_m is 7.5 in ") and f"near and {spec().perception_m} in " in note
+    assert note.endswith("circles; the checkpoint keeps that of the first") and load_data(both).spec == near
+    alike = replace(both, data=(circles, circles))
+    assert load_data(alike).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shown"),
+    [("feature_names", (*KINEMATIC_FEATURES, "size"), "size"), ("constant_features", ("role",), "role")],
+)
+def test_stores_of_different_features_do_not_mix(name: str, value: Any, shown: str, tmp_path: Path):
+    first = replace(spec(), feature_names=(*KINEMATIC_FEATURES, "role"), feature_scales=(1.0,) * 5)
+    paths = tmp_path / "first", tmp_path / "second"
+    for path, layout in zip(paths, (first, replace(first, **{name: value})), strict=True):
+        episodes = [circling_episode(i) for i in range(6)]
+        wider = [replace(e, states=np.pad(e.states, ((0, 0), (0, 0), (0, 1)))) for e in episodes]
+        write_store(path, StoreInfo(layout, "circles"), wider)
+    with pytest.raises(UserError, match=f"the same {name}, but .*first has .* and .*second has .*{shown}"):
+        load_data(replace(config(tmp_path / "first", tmp_path), data=paths))
+
+
 def test_validation_stores_must_fit(circles: Path, tmp_path: Path):
     write_store(tmp_path / "val", StoreInfo(spec(dt_s=0.2), "quick"), [circling_episode(0)])
-    with pytest.raises(UserError, match=r"store .*circles was trained at dt_s=1 but store .*val steps at dt_s=0\.2"):
+    with pytest.raises(UserError, match=r"the same dt_s, but .*circles has 1\.0 and .*val has 0\.2"):
         load_data(config(circles, tmp_path, val_data=(tmp_path / "val",)))
 
 
@@ -628,7 +670,7 @@ def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
     write_store(tmp_path / "equals", StoreInfo(spec(has_ego=False), "circles"), [circling_episode(i) for i in range(6)])
     with pytest.raises(UserError, match="first.*' needs episodes with an ego but store .*equals has none"):
         made(config(tmp_path / "equals", tmp_path / "second", init=first))
-    with pytest.raises(UserError, match="store .*circles needs episodes with an ego but store .*equals has none"):
+    with pytest.raises(UserError, match="the same has_ego, but .*circles has True and .*equals has False; train on"):
         load_data(config(circles, tmp_path / "second", val_data=(tmp_path / "equals",)))
 
 

@@ -1,0 +1,151 @@
+"""Data of a training: windows of all stores, split by episode into training and validation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from predictor.data.causal_edges import with_causal_edges
+from predictor.data.device_windows import with_agents
+from predictor.data.store import Episode, EpisodeStore, content_id, read_store
+from predictor.data.windows import Windows, siblings, split_episodes
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.remote import address
+from predictor.training.config import TrainConfig
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Keeps windows of all stores, split by episode."""
+
+    spec: SceneSpec
+    """Layout of the first store's scenes; the others are compatible."""
+    sources: tuple[str, ...]
+    """Source of each store's recordings."""
+    train: list[Windows]
+    """Training windows of each store."""
+    val: list[Windows]
+    """Windows of each store for model selection."""
+    train_episodes: list[Episode]
+    """All training episodes."""
+    notes: tuple[str, ...] = ()
+    """What the user should know about the stores, a sentence each."""
+
+
+def load_data(config: TrainConfig) -> TrainingData:
+    """Reads and splits the stores.
+
+    Raises:
+        UserError: stores differ in features, dt_s or whether there is an ego, have too few episodes, or val_data plays
+            episodes of data.
+    """
+    stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
+    if config.causal_edges:
+        if all(store.info.causal_threshold_m is None for store in stores[: len(config.data)]):
+            raise UserError("causal_edges needs a store with causal labels, got none; collect one with --branches 4")
+        stores = [with_causal_edges(store) for store in stores]
+    paths = [address(path) for path in (*config.data, *config.val_data)]
+    _check_alike(paths, stores)
+    most = max(store.info.spec.max_agents for store in stores[: len(config.data)])
+    spec = replace(stores[0].info.spec, max_agents=most)
+    _check_labels(config, stores)
+    notes = _differences(paths[: len(config.data)], stores)
+    sources = tuple(s.info.source for s in stores[: len(config.data)])
+    if config.val_data:
+        cut = len(config.data)
+        _check_held_out(paths, stores, cut)
+        training, held_back = ({content_id(path) for path in part} for part in (config.data, config.val_data))
+        if training & held_back:
+            raise UserError("val_data holds a store of data, so that nothing would be held out; leave val_data out")
+        chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
+        train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
+        val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
+        return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part], notes)
+    train, val, episodes, splits = [], [], [], []
+    for store in stores:
+        group = siblings(store.episodes)
+        parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
+        splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
+    # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
+    held = [{_played(store, i) for i in held_out} for store, (_, held_out) in zip(stores, splits, strict=True)]
+    for path, store, mine, (kept, held_out) in zip(config.data, stores, held, splits, strict=True):
+        elsewhere = set[Any]().union(*held) - mine - {None}
+        kept = [i for i in kept if _played(store, i) not in elsewhere][: config.max_episodes or None]
+        if not kept or not held_out:
+            raise UserError(
+                f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
+                f"{len(held_out)} for validation; both need at least one, so collect more"
+            )
+        chosen_here = [store.episodes[i] for i in kept]
+        train.append(_windows(config, chosen_here, spec, validation=False))
+        val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
+        episodes += chosen_here
+    return TrainingData(spec, sources, train, val, episodes, notes)
+
+
+def _played(store: EpisodeStore, number: int) -> tuple[str, int, str] | None:
+    """Returns which episode of which environment it is, as are its branches; None where seeds only number episodes."""
+    episode = store.episodes[number]
+    return (store.info.source, episode.seed, episode.label) if "seed" in store.info.provenance else None
+
+
+def _check_alike(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> None:
+    """Checks that a network for scenes of the first store can read those of all."""
+    first = stores[0].info.spec
+    for path, store in zip(paths, stores, strict=True):
+        spec = store.info.spec
+        for name in ("feature_names", "constant_features", "has_ego", "dt_s"):
+            ours, theirs = getattr(first, name), getattr(spec, name)
+            if abs(ours - theirs) > 1e-6 if name == "dt_s" else ours != theirs:
+                raise UserError(
+                    f"all stores need the same {name}, but {paths[0]} has {ours} and {path} has {theirs}; train on "
+                    "stores of one kind"
+                )
+
+
+def _differences(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> tuple[str, ...]:
+    """Returns a sentence for each setting in which a store differs from the first one, whose settings are kept."""
+    first = stores[0].info.spec
+    return tuple(
+        f"{name} is {getattr(first, name)} in {paths[0]} and {getattr(store.info.spec, name)} in {path}; the "
+        "checkpoint keeps that of the first"
+        for name in ("frame", "perception_m")
+        for path, store in zip(paths, stores, strict=False)
+        if getattr(store.info.spec, name) != getattr(first, name)
+    )
+
+
+def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: int) -> None:
+    """Checks that the stores from `cut` on hold no episode of those before, and no branch of one."""
+    played = [{p for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
+    for path, theirs in zip(paths[cut:], played[cut:], strict=True):
+        for trained, ours in zip(paths[:cut], played[:cut], strict=True):
+            if both := ours & theirs:
+                raise UserError(
+                    f"{path} (val_data) plays {len(both)} of the episodes of {trained}: the same environment and "
+                    f"seeds, such as {min(seed for _, seed, _ in both)}; collect it with another --seed, or leave "
+                    "val_data out"
+                )
+
+
+def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
+    """Checks that every training store has the labels for which the config has a weight."""
+    for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
+        for path, store in zip(config.data, stores, strict=False):
+            if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
+                raise UserError(
+                    f"{option} needs {name}, and store {address(path)} has none; set it to 0 or use labelled data"
+                )
+    kinds = {store.info.edge_attribute_names: address(path) for path, store in zip(config.data, stores, strict=False)}
+    if config.label_weight and len(kinds) > 1:
+        listed = ", ".join(f"{path} has {', '.join(names) or 'ones without names'}" for names, path in kinds.items())
+        raise UserError(f"label_weight needs the same edge attributes in every store, but {listed}; train on one kind")
+
+
+def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
+    whole = validation and config.val_history_steps > 1  # as in the tables: whole burn-in, whole horizon
+    future, history = (config.horizon_steps, config.val_history_steps) if whole else (1, 1)
+    windows = Windows(episodes, spec, config.history_steps, config.horizon_steps, future, history)
+    return windows if validation else with_agents(windows)
