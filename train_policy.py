@@ -164,6 +164,13 @@ class TrainPolicyConfig:
                 raise UserError(f"{name} has no effect with observe=none; leave one out")
         if self.driver != type(self).driver:
             require_multiagent(self.env_id, "driver", "drives the other agents of PettingZoo")
+            if not self.plan.task.learners:
+                raise UserError(
+                    f"driver drives the agents that do not learn, and all of {self.env_id} do; name those that learn "
+                    "(learners), or leave driver out"
+                )
+        if not self.shaping:
+            require_multiagent(self.env_id, "no-shaping", "changes the rewards of simple_tag alone")
         for name in ("eval_episodes", "selection_episodes"):
             check_count(getattr(self.sizes, name), name)
         check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")

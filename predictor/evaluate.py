@@ -30,7 +30,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import check_out, write_json, write_text
+from predictor.support.files import check_out, finite, write_json, write_text
 from predictor.support.memory import check_count
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
@@ -154,7 +154,7 @@ def _write(config: EvaluateConfig, accuracies: Sequence[Accuracy], source: str, 
     config.out.mkdir(parents=True, exist_ok=True)
     made = provenance(("torch", "numpy"))
     content = {"source": source, "dt_s": dt_s, "config": asdict(config), "rows": [asdict(a) for a in accuracies]}
-    write_json(config.out / "accuracy.json", content | {"provenance": made})
+    write_json(config.out / "accuracy.json", finite(content | {"provenance": made}))
     write_text(config.out / "accuracy.md", markdown_table(accuracies, dt_s))
 
 

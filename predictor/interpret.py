@@ -33,7 +33,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import check_out, scratch_folder, write_json, write_text
+from predictor.support.files import check_out, finite, scratch_folder, write_json, write_text
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device
@@ -122,7 +122,7 @@ def interpret(config: InterpretConfig) -> Findings:
         shown = _shown(config, model, windows, first, store.info)
         graphs = _shown(config, model, windows, _by_accuracy(np.sort(drawn), accuracies), store.info)
         _draw(partial, config, content, findings, shown, graphs, info.spec)
-        write_json(partial / "scores.json", content)
+        write_json(partial / "scores.json", finite(content))
         write_text(partial / "scores.md", scores_markdown(content))
         out.mkdir(exist_ok=True)
         for name in FILES:

@@ -31,7 +31,7 @@ from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json, write_text
+from predictor.support.files import finite, write_json, write_text
 from predictor.support.jobs import run_tasks
 from predictor.support.locks import locked
 from predictor.support.memory import check_count, check_processes
@@ -321,7 +321,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         "provenance": provenance(PACKAGES),
     }
     config.folder.mkdir(parents=True, exist_ok=True)
-    write_json(config.folder / "table.json", content)
+    write_json(config.folder / "table.json", finite(content))
     for name, text in (("table.md", markdown_report(content)), ("table.tex", latex_table(content))):
         write_text(config.folder / name, text)
     if lines:

@@ -589,9 +589,18 @@ def test_evaluating_no_run_is_one_clear_line(
         ({"observe": "none", "num_samples": 6}, "num_samples has no effect with observe=none; leave one out"),
         ({"observe": "none", "horizon_steps": 3}, "horizon_steps has no effect with observe=none; leave one out"),
         ({"driver": "mixed"}, "driver drives the other agents of PettingZoo, merge-v1 has one ego; leave driver out"),
+        (
+            {"shaping": False},
+            "no-shaping changes the rewards of simple_tag alone, merge-v1 has one ego; leave no-shaping out",
+        ),
+        (
+            {"env_id": "simple_spread_v3", "driver": "mixed"},
+            r"driver drives the agents that do not learn, and all of simple_spread_v3 do; name those that learn "
+            r"\(learners\), or leave driver out",
+        ),
         ({"eval_episodes": 20_000}, "eval_episodes must be at most 10,000, got 20000"),
     ],
 )
 def test_an_option_without_effect_is_refused(options: dict[str, Any], message: str):
     with pytest.raises(UserError, match=f"^{message}$"):
-        train_policy.TrainPolicyConfig("merge-v1", **options)
+        train_policy.TrainPolicyConfig(**{"env_id": "merge-v1"} | options)

@@ -1,6 +1,7 @@
 """The suite: lines are trained and measured once, failures say why, and the table says what was run."""
 
 import json
+import math
 import multiprocessing
 import os
 import sys
@@ -279,6 +280,17 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     monkeypatch.setattr(jobs, "_started", lambda *_: pytest.fail("a finished line was started again"))
     again = run_suite(settings)
     assert again["rows"] == content["rows"]
+
+
+def test_what_was_not_measured_is_null_in_the_table(data: Path, tmp_path: Path):
+    """JSON has no NaN; most readers of other languages refuse it."""
+    settings = config(data, tmp_path, lines=("constant-velocity",))
+    run_line(settings, line("constant-velocity"))
+    file = line_folder(settings, line("constant-velocity")) / "result.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"unmeasured_m": math.nan}))
+    run_suite(settings)
+    text = (settings.folder / "table.json").read_text()
+    assert json.loads(text)["rows"][0]["unmeasured_m"] is None and "NaN" not in text
 
 
 @pytest.mark.slow
