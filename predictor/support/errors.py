@@ -6,6 +6,7 @@ is told by `predictor.support.stopping.resumable`.
 
 import contextlib
 import errno
+import io
 import os
 import select
 import signal
@@ -92,6 +93,9 @@ def run_entry_point(main: Callable[[], None]) -> None:
     Exit status: 2 after an error, 130 after Ctrl-C, 143 after SIGTERM; 141 and no line where whatever read the
     output has left (`| head`).
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without Unicode shows ? for what it does not have
+            stream.reconfigure(errors="replace")
     try:
         with _until_reader_leaves(), _terminable():
             main()

@@ -51,6 +51,12 @@ def load_data(config: TrainConfig) -> TrainingData:
     most = max(store.info.spec.max_agents for store in stores[: len(config.data)])
     spec = replace(stores[0].info.spec, max_agents=most)
     _check_labels(config, stores)
+    longest = max((len(e.states) for store in stores for e in store.episodes), default=0)
+    if config.horizon_steps >= longest:  # such windows would fill the memory with steps that no episode has
+        raise UserError(
+            f"episodes have at most {longest} steps, a horizon of {config.horizon_steps:,} needs "
+            f"{config.horizon_steps + 1:,}; lower --horizon-steps or collect longer episodes"
+        )
     notes = _differences(paths[: len(config.data)], stores)
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:

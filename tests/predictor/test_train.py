@@ -421,6 +421,15 @@ def test_a_kill_during_a_validation_loses_no_step(tiny: None, circles: Path, tmp
     assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), resumed.parameters(), strict=True))
 
 
+def test_a_horizon_beyond_all_episodes_is_refused_before_windows_are_made(circles: Path, tmp_path: Path):
+    longest = max(len(episode.states) for episode in read_store(circles).episodes)
+    with pytest.raises(UserError, match=f"episodes have at most {longest} steps, a horizon of {longest} needs"):
+        train(config(circles, tmp_path / "run", horizon_steps=longest))
+    with pytest.raises(UserError, match="a horizon of 20,000 needs 20,001; lower --horizon-steps"):
+        train(config(circles, tmp_path / "run", horizon_steps=20_000))
+    assert not (tmp_path / "run" / "train_state.pt").exists()
+
+
 def test_tracks_shorter_than_the_horizon_are_refused_before_a_step(tiny: None, tmp_path: Path):
     """The episodes are long enough, but nobody stays for the whole horizon."""
     episodes = []

@@ -108,6 +108,14 @@ def test_an_output_that_is_closed_changes_no_end(closed: str):
     assert status == 1 and errors.endswith("BrokenPipeError: of a process\n")
 
 
+@pytest.mark.parametrize("main", ["print('5 m² ± 1')", "sys.exit('5 m² ± 1')", "raise UserError('5 m² ± 1')"])
+def test_a_terminal_without_unicode_shows_the_rest(main: str):
+    said = f"import sys\nfrom predictor.support.errors import *\ndef main():\n {main}\nrun_entry_point(main)"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    ended = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, env=environment)
+    assert "5 m? ? 1" in ended.stdout + ended.stderr and "Traceback" not in ended.stderr
+
+
 def test_a_broken_pipe_of_another_process_is_raised_while_the_output_is_read():
     said = "from predictor.support.errors import run_entry_point\ndef main(): raise BrokenPipeError('of a process')\n"
     ended = subprocess.run([sys.executable, "-c", f"{said}run_entry_point(main)"], capture_output=True, text=True)
