@@ -70,7 +70,8 @@ class Accuracy:
     true_overlap: float = math.nan
     """Share of the truth that `overlap` should have."""
     mixture_nll: list[float] = field(default_factory=list)
-    """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales."""
+    """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales. With
+    more samples than modes it is the mixture of the samples drawn, of equal weights."""
     mixture_coverage: list[float] = field(default_factory=list)
     """Share of true coordinates within the central 90 % of the predicted mixture at each step; empty without predicted
     scales."""
