@@ -6,6 +6,7 @@ initial speed) the settings are those that NRI publishes. Motion is integrated b
 once: symplectic, so energy does not drift.
 """
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -332,12 +333,15 @@ def write_splits(
     took: dict[str, float] = {}
     made = provenance(("torch", "numpy", "zarr"))
     names = list(splits)
+    kept = [address(out / name) for name, count in splits.items() if not count and exists(out / name)]
     splits = {name: count for name, count in splits.items() if count}
     if not splits:
         raise UserError("nothing to simulate: " + ", ".join(names[:-1]) + f" and {names[-1]} are all 0")
     for name in splits:
         if exists(out / name) and not overwrite:
             raise UserError(f"{address(out / name)} exists; choose another --out or pass --overwrite")
+    if kept:
+        print(f"kept as {'it is' if len(kept) == 1 else 'they are'}: {', '.join(kept)}", file=sys.stderr)
     with WorkShown("simulate", sum(splits.values())) as shown:
         for name, count in splits.items():
             began = time.perf_counter()

@@ -394,6 +394,9 @@ def test_existing_splits_are_not_overwritten_unasked(
     assert (tmp_path / "data" / "test" / "zarr.json").read_bytes() == before
     make(config(tmp_path / "data", seed=1, overwrite=True))
     assert len(read_store(tmp_path / "data" / "train").episodes) == 4
+    assert "kept" not in capsys.readouterr().err
+    make(config(tmp_path / "data", seed=2, ood=0, overwrite=True))
+    assert f"kept as it is: {tmp_path}/data/ood\n" in capsys.readouterr().err, "it is of another seed than the rest"
 
 
 def test_constants_must_be_positive(tmp_path: Path):
