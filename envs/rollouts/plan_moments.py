@@ -69,6 +69,8 @@ class PlanMoment:
     """Such a sum for the forecast that is given the plan; in branch 0 the plan is what the ego then did."""
     risk: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability of a collision within the horizon, by forecaster; the own driver has none."""
+    risk_of_planner: dict[str, Float[np.ndarray, " plans"]]
+    """The same with the plan model's margin around every agent, by which the planner chooses."""
 
 
 def play_plans(task: PlanTask) -> list[PlanMoment]:
@@ -129,7 +131,7 @@ def moment(
     for valid in counted:
         valid[0] = False  # the ego
     followed = np.concatenate([point.plain.states[None, 1:, 0], plans.states])
-    without_m, with_m, risk = {}, {}, {}
+    without_m, with_m, risk, risk_of_planner = {}, {}, {}, {}
     for name, forecaster in forecasters.items():
         plain, planned = forecaster.forecast(), forecaster.forecast_plans(followed)
         without_m[name] = np.array(
@@ -141,8 +143,10 @@ def moment(
                 for branch, ((xy, _), ok) in enumerate(zip(future, counted, strict=True))
             ]
         )
-        risk[name] = _risk(planned, scene, plans, world.spec.dt_s)
-    return PlanMoment(seed, step, crashed, np.array([ok.sum() for ok in counted]), without_m, with_m, risk)
+        risk[name] = _risk(planned, scene, plans, world.spec.dt_s, 0.0)
+        risk_of_planner[name] = _risk(planned, scene, plans, world.spec.dt_s, plans.margin_m)
+    agents = np.array([ok.sum() for ok in counted])
+    return PlanMoment(seed, step, crashed, agents, without_m, with_m, risk, risk_of_planner)
 
 
 class _Script:
@@ -184,9 +188,10 @@ def _error_m(
     return float(np.linalg.norm(forecast[counted] - future[counted], axis=-1).mean(axis=-1).sum())
 
 
-def _risk(planned: Forecast, scene: Scene, plans: Plans, dt_s: float) -> Float[np.ndarray, " plans"]:
-    """Computes the risk of each plan, as the planner does but without its margin; the first entry is no plan's."""
-    survival = contacts(planned, SceneBatch.stack([scene]), plans.size_m, dt_s).survival()[0, 1:, -1]
+def _risk(planned: Forecast, scene: Scene, plans: Plans, dt_s: float, margin_m: float) -> Float[np.ndarray, " plans"]:
+    """Computes the risk of each plan, as the planner does with this margin; the first entry is no plan's."""
+    length_m, width_m = (size + margin_m for size in plans.size_m)  # half of it around each agent
+    survival = contacts(planned, SceneBatch.stack([scene]), (length_m, width_m), dt_s).survival()[0, 1:, -1]
     if plans.crashed is not None:
         survival = survival * ~plans.crashed[:, -1]
     return 1.0 - survival

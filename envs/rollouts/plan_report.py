@@ -20,7 +20,7 @@ from predictor.support.markdown import table
 
 HEADS = (
     "forecaster", "others' ADE [m]", "the ego's true plan given", "less by (95 %)", "plans: ADE without [m]", "given",
-    "less by (95 %)", "pairs of plans", "right choices (95 %)", "Brier score (95 %)",
+    "less by (95 %)", "pairs of plans", "right choices (95 %)", "… with margin (95 %)", "Brier score (95 %)",
 )  # fmt: skip
 """Columns of the table."""
 
@@ -67,7 +67,7 @@ def _cells(name: str, found: PlanScores) -> list[str]:
     return [
         name, metres(found.own.without_m), metres(found.own.with_m), _percent(found.own.reduction),
         metres(found.plans.without_m), metres(found.plans.with_m), _percent(found.plans.reduction),
-        str(found.choices), _percent(found.right), _plain(found.brier),
+        str(found.choices), _percent(found.right), _percent(found.right_of_planner), _plain(found.brier),
     ]  # fmt: skip
 
 

@@ -55,6 +55,8 @@ class PlanScores:
     """Number of pairs of plans of one moment of which one alone ended in a collision."""
     right: Estimate | None
     """Share of those pairs in which that plan had the higher risk; equal risks count half."""
+    right_of_planner: Estimate | None
+    """The same by the risk with the planner's margin."""
     brier: Estimate | None
     """Mean squared difference of risk and outcome over all plans."""
 
@@ -170,18 +172,26 @@ def scores_of(episodes: Sequence[Sequence[PlanMoment]], name: str) -> PlanScores
         episodes: moments of each episode.
         name: name of the forecaster.
     """
-    own, plans, choices, squares = (
+    own, plans, choices, guarded, squares = (
         np.array(sums) for sums in zip(*(_sums(found, name) for found in episodes), strict=True)
     )
-    return PlanScores(_benefit(own), _benefit(plans), int(choices[:, 1].sum()), _share(choices), _share(squares))
+    return PlanScores(
+        _benefit(own), _benefit(plans), int(choices[:, 1].sum()), _share(choices), _share(guarded), _share(squares)
+    )
 
 
 def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, " parts"], ...]:
-    """Returns the sums of an episode: errors without, with and agents (own, plans), right and all choices, squares."""
+    """Returns the sums of an episode: errors without, with and agents (own, plans), right and all choices, squares.
+
+    The choices are by the risk, and by the risk with the planner's margin.
+    """
     errors = np.array([[m.without_m[name], m.with_m[name], m.agents] for m in moments])  # moments, parts, branches
-    choices = np.sum([right_choices(m.risk[name], m.crashed[1:]) for m in moments], axis=0)
+    choices, guarded = (
+        np.sum([right_choices(risk[name], m.crashed[1:]) for m, risk in zip(moments, risks, strict=True)], axis=0)
+        for risks in ([m.risk for m in moments], [m.risk_of_planner for m in moments])
+    )
     squares = np.sum([[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in moments], axis=0)
-    return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, squares
+    return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, guarded, squares
 
 
 def right_choices(risk: Float[np.ndarray, " plans"], crashed: Bool[np.ndarray, " plans"]) -> tuple[float, int]:

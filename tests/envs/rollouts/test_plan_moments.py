@@ -55,6 +55,25 @@ def test_a_plan_that_runs_into_the_car_ahead_collides_and_is_the_riskiest():
     assert risk["FASTER"] == risk["IDLE"] == 1.0 and risk["LANE_LEFT"] == 0.0
 
 
+class Wide:
+    """The plan model of highway-env with so large a margin that nobody can pass."""
+
+    def __init__(self, model: Any) -> None:
+        self._model, self.names = model, model.names
+
+    def plans(self, env: Any, horizon_steps: int) -> Any:
+        return replace(self._model.plans(env, horizon_steps), margin_m=9.0)
+
+
+def test_the_planners_risk_has_its_margin_around_every_agent():
+    world = slow_ahead()
+    usual, wide = (moment(world, model, observed(world), 0, 0, HORIZON)
+                   for model in (plan_model_for(world.env), Wide(plan_model_for(world.env))))  # fmt: skip
+    left = plan_model_for(world.env).names.index("LANE_LEFT")
+    assert usual.risk_of_planner[STRAIGHT][left] == 0.0 and wide.risk_of_planner[STRAIGHT][left] == 1.0
+    np.testing.assert_array_equal(usual.risk[STRAIGHT], wide.risk[STRAIGHT])
+
+
 def test_errors_are_those_of_the_others_where_nobody_collides():
     world = slow_ahead()
     found = moment(world, plan_model_for(world.env), observed(world), 0, 0, HORIZON)

@@ -14,8 +14,12 @@ HELPS = Benefit(40, 1.25, 1.0, Estimate(0.2, (0.1, 0.3)))
 HARMS = Benefit(80, 0.5, 0.55, Estimate(-0.1, (-0.15, 0.05)))
 NOTHING = Benefit(0, None, None, None)
 SCORES = {
-    "constant velocity": PlanScores(HARMS, NOTHING, 12, Estimate(0.75, (0.5, 1.0)), Estimate(0.1, None)),
-    "ours": PlanScores(HELPS, HARMS, 12, Estimate(1.0, (1.0, 1.0)), Estimate(0.02, (0.01, 0.03))),
+    "constant velocity": PlanScores(
+        HARMS, NOTHING, 12, Estimate(0.75, (0.5, 1.0)), Estimate(0.5, None), Estimate(0.1, None)
+    ),
+    "ours": PlanScores(
+        HELPS, HARMS, 12, Estimate(1.0, (1.0, 1.0)), Estimate(0.9, (0.8, 1.0)), Estimate(0.02, (0.01, 0.03))
+    ),
 }
 RESULT = EnvPlans(
     "merge-v1", "varied", 1.0, 5, 50, ("IDLE", "FASTER"), 120, [0.1, 0.35], SCORES, {"far": "steps of 0.2 s"}
@@ -26,16 +30,16 @@ def test_lines_of_the_page():
     lines = markdown([RESULT]).splitlines()
     assert lines[0] == "### merge-v1, driven varied: 120 moments of 50 episodes, 5 × 1 s"
     straight, ours = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines[4:6])
-    assert straight[4:7] == ["–", "–", "–"] and straight[9] == "0.100"
+    assert straight[4:7] == ["–", "–", "–"] and straight[9:] == ["50.0 %", "0.100"]
     assert ours[:4] == ["ours", "1.25", "1.00", "20.0 % (10.0 to 30.0)"]
     assert ours[4:7] == ["0.500", "0.550", "−10.0 % (−15.0 to 5.0)"]
-    assert ours[7:] == ["12", "100.0 % (100.0 to 100.0)", "0.020 (0.010 to 0.030)"]
+    assert ours[7:] == ["12", "100.0 % (100.0 to 100.0)", "90.0 % (80.0 to 100.0)", "0.020 (0.010 to 0.030)"]
     assert lines[-2:] == ["* collisions by plan: IDLE 10 %, FASTER 35 %", "* left out: far: steps of 0.2 s"]
 
 
 def test_the_terminal_has_the_same_cells():
     text = StringIO()
-    Console(file=text, width=220).print(shown(RESULT))
+    Console(file=text, width=250).print(shown(RESULT))
     assert "20.0 % (10.0 to 30.0)" in text.getvalue() and "others' ADE [m]" in text.getvalue()
 
 
@@ -54,7 +58,7 @@ def test_curves_have_the_numbers():
     plt.close(figure)
 
 
-@pytest.mark.parametrize("scores", [SCORES, {"ours": PlanScores(NOTHING, NOTHING, 0, None, None)}])
+@pytest.mark.parametrize("scores", [SCORES, {"ours": PlanScores(NOTHING, NOTHING, 0, None, None, None)}])
 def test_a_figure_is_written(scores: dict[str, PlanScores], tmp_path: Path):
     write_picture(tmp_path, replace(RESULT, scores=scores))
     assert [path.name for path in tmp_path.iterdir()] == ["merge-v1.plans.png"]

@@ -21,12 +21,21 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget()
 
 
-def found(seed: int, crashed: list[bool], risk: list[float], with_m: float = 1.0) -> PlanMoment:
+def found(
+    seed: int, crashed: list[bool], risk: list[float], with_m: float = 1.0, guarded: list[float] | None = None
+) -> PlanMoment:
     """The own driver and two plans, three agents each; an error of 2 m per agent without a plan."""
     hit = np.array([False, *crashed])
     agents = np.where(hit, 0, 3)
     return PlanMoment(
-        seed, 5, hit, agents, {"model": 2.0 * agents}, {"model": with_m * agents}, {"model": np.array(risk)}
+        seed,
+        5,
+        hit,
+        agents,
+        {"model": 2.0 * agents},
+        {"model": with_m * agents},
+        {"model": np.array(risk)},
+        {"model": np.array(guarded or risk)},
     )
 
 
@@ -40,7 +49,7 @@ def test_a_choice_is_right_if_the_plan_that_collides_has_the_higher_risk():
 
 def test_scores_of_known_moments():
     episodes = [
-        [found(0, [True, False], [0.8, 0.2]), found(0, [False, False], [0.0, 0.0])],
+        [found(0, [True, False], [0.8, 0.2], guarded=[0.9, 0.9]), found(0, [False, False], [0.0, 0.0])],
         [found(1, [True, False], [0.1, 0.6])],
     ]
     scores = scores_of(episodes, "model")
@@ -48,6 +57,7 @@ def test_scores_of_known_moments():
     assert scores.own.reduction is not None and scores.own.reduction.value == 0.5
     assert scores.plans.agents == 12 and scores.choices == 2
     assert scores.right is not None and scores.right.value == 0.5 and scores.right.interval == (0.0, 1.0)
+    assert scores.right_of_planner is not None and scores.right_of_planner.value == 0.25, "0.5 of 2 pairs"
     assert scores.brier is not None
     assert scores.brier.value == pytest.approx((0.04 + 0.04 + 0.0 + 0.0 + 0.81 + 0.36) / 6)
 
@@ -61,7 +71,7 @@ def test_a_plan_that_harms_lowers_the_reduction_below_zero():
 def test_nothing_to_compare_is_none_and_no_error():
     hit = PlanMoment(
         0, 5, np.array([True, True]), np.array([0, 0]), {"model": np.zeros(2)}, {"model": np.zeros(2)},
-        {"model": np.ones(1)},
+        {"model": np.ones(1)}, {"model": np.ones(1)},
     )  # fmt: skip
     scores = scores_of([[hit]], "model")
     assert (scores.own.agents, scores.own.reduction, scores.right) == (0, None, None)
