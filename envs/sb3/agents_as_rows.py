@@ -17,7 +17,6 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
@@ -27,40 +26,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from envs.batched_forward import collected
 from envs.parallel import batch_forwards, living
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
+from envs.sb3.partners import Partner, chosen_partner
 from envs.seeding import driver_rng
 from predictor.support.errors import ProtocolError, UserError
-
-Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
-"""Driver of the agents that do not learn: the env, their observations, a generator → an action for each of them."""
-
-
-def random_actions(
-    env: ParallelEnv, observations: dict[str, Any], generator: np.random.Generator
-) -> dict[str, NDArray[Any] | int]:
-    """Returns actions drawn uniformly from each agent's Discrete or bounded Box space: the partner "random".
-
-    Raises:
-        UserError: an agent's action space is another one.
-    """
-    actions: dict[str, NDArray[Any] | int] = {}
-    for agent in observations:
-        space = env.action_space(agent)
-        if isinstance(space, gym.spaces.Discrete):
-            actions[agent] = int(space.start + generator.integers(space.n))
-        elif isinstance(space, gym.spaces.Box) and space.is_bounded():
-            if np.issubdtype(space.dtype, np.integer):
-                actions[agent] = generator.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
-            else:
-                actions[agent] = np.asarray(generator.uniform(space.low, space.high), dtype=space.dtype)
-        else:
-            raise UserError(
-                f"partner 'random' needs Discrete or bounded Box actions, agent '{agent}' has {space}; pass a callable"
-            )
-    return actions
-
-
-PARTNERS: dict[str, Partner] = {"random": random_actions}
-"""Partners by name."""
 
 
 class ParallelVecEnv(VecEnv):
@@ -114,8 +82,8 @@ class ParallelVecEnv(VecEnv):
         self.envs = _make_copies(factories)
         self._forward = batch_forwards(self.envs)
         names = _choose_learners(self.envs[0].possible_agents, agents)
-        drive = _choose_partner(self.envs[0].possible_agents, names, partner)
-        self._copies = [_Copy(env, names, drive) for env in self.envs]
+        drive = chosen_partner(self.envs[0].possible_agents, names, partner)
+        self._copies = [_Copy(env, names, drive, self._forward is not None) for env in self.envs]
         observations = {name: self.envs[0].observation_space(name) for name in names}
         actions = {name: self.envs[0].action_space(name) for name in names}
         roles = roles_of(observations, actions)
@@ -283,8 +251,8 @@ class _Turn:
 class _Copy:
     """One copy of the environment, with the latest observations of the living agents and the partner's generator."""
 
-    def __init__(self, env: ParallelEnv, learners: list[str], partner: Partner | None) -> None:
-        self.env, self.learners, self.partner = env, learners, partner
+    def __init__(self, env: ParallelEnv, learners: list[str], partner: Partner | None, filled_later: bool) -> None:
+        self.env, self.learners, self.partner, self._filled_later = env, learners, partner, filled_later
         self.living: dict[str, Any] | None = None
         self._lived: set[str] = set()
         self._generator = np.random.default_rng()
@@ -322,8 +290,11 @@ class _Copy:
             turn = _Turn(True, float(rewards.get(agent, 0.0)), not lives, info=dict(infos.get(agent, {})))
             if turn.done:
                 turn.truncated = not terminated.get(agent, False)
-                last = observations.get(agent, before[agent])  # a Dict gets forecasts later, for all copies at once
-                turn.closing = last if isinstance(last, dict) else deepcopy(last)  # a reset may write into it
+                last = observations.get(agent, before[agent])
+                turn.closing = deepcopy(last)  # a reset may write into it
+                if self._filled_later:  # the forecasts of all copies are put into the wrapper's own dict
+                    last.update(turn.closing)
+                    turn.closing = last
             turns.append(turn)
         return turns
 
@@ -379,19 +350,6 @@ def _choose_learners(possible: Sequence[str], agents: Sequence[str] | None) -> l
     if unknown or not names or len(set(names)) < len(names):
         raise UserError(f"agents must name some of {list(possible)}, each once; got {names}")
     return names
-
-
-def _choose_partner(possible: Sequence[str], learners: list[str], partner: Partner | str | None) -> Partner | None:
-    others = [name for name in possible if name not in learners]
-    if others and partner is None:
-        raise UserError(f"{others} do not learn and need a driver; pass partner= ({', '.join(PARTNERS)})")
-    if partner is not None and not others:
-        raise UserError("a partner drives agents that do not learn, but all agents learn; name the learners in agents=")
-    if isinstance(partner, str):
-        if partner not in PARTNERS:
-            raise UserError(f"no partner is called '{partner}'; known: {', '.join(PARTNERS)}, or pass a callable")
-        return PARTNERS[partner]
-    return partner
 
 
 def _is_wrapped(env: Any, wrapper_class: type[Any]) -> bool:

@@ -19,7 +19,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
-from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv, random_actions
+from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
+from envs.sb3.partners import random_actions
 from predictor.support.errors import ProtocolError, UserError
 
 SIZES = {"ant_0": 2, "ant_1": 2, "bee_0": 3}
