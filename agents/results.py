@@ -15,7 +15,7 @@ from agents.episode_file import write_episodes
 from agents.runs import SUMMARY_FILE
 from agents.summaries import NEARLY_CONSTANT, PolicySummary, reports_only_events, summarize
 from agents.vec_envs import EpisodeResult
-from envs.registry import name_with
+from envs.registry import check_arguments, name_with
 from envs.rollouts.driving_measures import HARD_BRAKING_MPS2, LONGEST_S
 from predictor.evaluation.standard_errors import Estimate
 from predictor.support import markdown
@@ -204,6 +204,7 @@ def read_evaluation(file: Path) -> Evaluation:
         raise UserError(f"{file} has no episodes; evaluate the policy again")
     names = ("env_id", "first_seed", "env_kwargs", "has_ego")
     values: dict[str, Any] = {name: content[name] for name in names if name in content}
+    check_arguments(values.get("env_kwargs", ""), f"{file}: env_kwargs")
     return from_table(Evaluation, values, str(file), {"results": results})
 
 

@@ -102,7 +102,7 @@ def films(run: Path) -> list[Block]:
     Raises:
         UserError: one of them is no regular file.
     """
-    folders = (run, run / "evaluation")
+    folders = (run / "evaluation", run)
     found = [file for folder in folders for file in sorted(folder.glob("*.mp4")) if not file.name.startswith(".")]
     blocks: list[Block] = []
     room = INSIDE_TOTAL_BYTES
@@ -111,6 +111,8 @@ def films(run: Path) -> list[Block]:
         data = read_bytes(file, MOST_FILM_BYTES) if size <= min(INSIDE_BYTES, room) else b""
         room -= len(data)
         blocks.append(Film(file.relative_to(run).as_posix(), _caption(file), _still(file), data))
+    if more := len(found) - len(blocks):
+        blocks.append(Paragraph(f"{more} more films are in the folder."))
     return [Heading("Films"), *blocks] if blocks else []
 
 

@@ -23,6 +23,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
+from envs.registry import check_arguments
 from envs.sb3.algorithms import algorithm_of_model
 from envs.sb3.policy_file import FORECASTER, ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.support.errors import UserError
@@ -38,6 +39,9 @@ CURVE_FILE = "curve.json"
 SUMMARY_FILE = "summary.json"
 SHIPPED = Path(__file__).resolve().parent / "pretrained"
 """Folder of the policies that ship, NAME.zip each."""
+LARGEST = 1e30
+"""Largest size of a number in a learning curve; larger ones cannot be drawn."""
+
 _BUFFER_ENTRY = "replay_buffer.pkl"
 
 
@@ -158,6 +162,9 @@ def check_point(point: Mapping[str, Any], where: str) -> None:
         converted(point[name], kind, f"{where}: {name}")
     for name, value in point.items():
         converted(value, float | None, f"{where}: {name}")
+    for name, value in point.items():
+        if value is not None and abs(value) > LARGEST:
+            raise UserError(f"{where}: {name} must be at most {LARGEST:g} in size, got {value:g}")
     if point["steps"] < 0:
         raise UserError(f"{where}: steps must not be negative, got {point['steps']}")
 
@@ -253,7 +260,8 @@ def _read(file: Path) -> dict[str, Any]:
     for name, kind in (("env_id", str), ("observe", str), ("algorithm", Algorithm)):
         if name in config:
             converted(config[name], kind, f"{file}: {name}")
-    converted(content.get("provenance", []), list, f"{file}: provenance")
+    check_arguments(config.get("env_kwargs", ""), f"{file}: env_kwargs")
+    converted(content.get("provenance", []), tuple[Any, ...], f"{file}: provenance")
     return content
 
 

@@ -7,7 +7,6 @@ disjoint from training and from the final evaluation, so selection does not bias
 import contextlib
 import math
 import time
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +33,7 @@ from agents.summaries import mean_of_known
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
-from envs.sb3.policy_file import PolicyNote, read_note
+from envs.sb3.policy_file import PolicyNote, read_note, selection_return
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file, write_json
@@ -139,6 +138,7 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
             _learn(plan, model, selection, run_dir, note, progress_bar)
             save_model(model, run_dir / CHECKPOINT_FILE, note=note, to_continue=True)
     if (run_dir / BEST_FILE).exists():
+        selection_return(run_dir / BEST_FILE)  # refuses a damaged file
         copy_file(run_dir / BEST_FILE, policy)
     elif learns or not policy.exists():  # it was damaged, and removed as the message says; the last model stands for it
         save_model(model, policy, note=note)
@@ -326,11 +326,8 @@ class SelectBest(BaseCallback):
     def _on_training_start(self) -> None:
         """Continues from the results inside an existing file."""
         self._measured_at = begun = self.model.num_timesteps
-        try:
-            stored = read_note(self._path).get("selection_return", -math.inf)
-        except zipfile.BadZipFile as error:
-            raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
-        self._highest = stored if begun else -math.inf  # with nothing to go on from, it is that of another training
+        stored = selection_return(self._path)  # with nothing to go on from, it is that of another training
+        self._highest = stored if begun else -math.inf
         if self._curve is not None:
             self._points = [p for p in read_curve(self._curve) if p["steps"] <= begun]
             self._measured_at = self._points[-1]["steps"] if self._points else 0

@@ -16,7 +16,8 @@ from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpoo
 from envs.simulators.highway_settings import check_settings
 from predictor.support.errors import UserError, named, short
 from predictor.support.importing import load_named
-from predictor.support.reading import as_object, parse_json
+from predictor.support.reading import parse_json
+from predictor.support.typed_values import converted
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -145,15 +146,29 @@ def arguments_of(text: str) -> dict[str, Any]:
         UserError: it is no JSON object, or holds the id or what commands set by themselves.
     """
     try:
-        kwargs = as_object(parse_json(text or "{}", "env_kwargs"), "env_kwargs")
+        kwargs = parse_json(text or "{}", "env_kwargs")
     except UserError as error:
         raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}: {error}") from error
+    if not isinstance(kwargs, dict):
+        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}")
     if "env_id" in kwargs or "id" in kwargs:
         raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
     for name in _OF_GYMNASIUM:
         if name in kwargs:
             raise UserError(f"env_kwargs cannot hold {name}, which each command sets by itself; leave it out")
     return kwargs
+
+
+def check_arguments(text: Any, where: str) -> None:
+    """Checks arguments of an environment that a file holds; see `arguments_of`.
+
+    Raises:
+        UserError: they are no such text; the message begins with `where`.
+    """
+    try:
+        arguments_of(converted(text, str, "env_kwargs"))
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
 
 
 def name_with(env_id: str, env_kwargs: str) -> str:

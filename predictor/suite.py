@@ -74,7 +74,7 @@ class SuiteConfig:
     out: Path = Path("runs/suite")
     """Folder for runs, results and tables, with a folder below it for each table and budget."""
     budget: Budget = "cpu"
-    """Sizes of networks and training: "smoke" takes minutes, "cpu" hours on two cores with smaller networks,
+    """Sizes of networks and training: "smoke" takes minutes, "cpu" about an hour on two cores with smaller networks,
     "paper" needs a GPU for the paper's sizes."""
     lines: tuple[str, ...] = ()
     """Keys of the lines to run; none runs all."""

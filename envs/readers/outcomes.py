@@ -30,23 +30,26 @@ class OutcomeKeys:
     def crashed(self, info: Mapping[str, Any]) -> bool | None:
         """Returns whether an info reports a crash, of any ego where there are several; None if it says nothing."""
         value = _first(info, self.crash)
-        return None if value is None else bool(np.any(_flags(value, self.crash)))
+        return None if value is None else bool(np.any(_shares(value, self.crash) > 0))
 
     def succeeded(self, info: Mapping[str, Any]) -> bool | None:
         """Returns whether an info reports success, of all egos where there are several; None if it says nothing."""
         value = _first(info, self.success)
-        return None if value is None else bool(np.all(_flags(value, self.success)))
+        return None if value is None else bool(np.all(_shares(value, self.success) == 1))
 
 
-def _flags(value: Any, keys: Sequence[str]) -> np.ndarray:
-    """Returns whether, for each ego, as an array; a dict or a text, which would always be true, is refused."""
+def _shares(value: Any, keys: Sequence[str]) -> np.ndarray:
+    """Returns what an info says as an array: 1 (true) or 0 for each ego, or the share of all, as highway-env does.
+
+    A dict, a text or a speed, which would always be true, is refused.
+    """
     try:
-        flags = np.asarray(value)
+        shares = np.asarray(value)
     except ValueError:  # rows of unequal length
-        flags = np.asarray(None)
-    if flags.dtype.kind not in "buif":
+        shares = np.asarray(None)
+    if shares.dtype.kind not in "buif" or not ((shares >= 0) & (shares <= 1)).all():
         raise UserError(f"info {' or '.join(keys)} must be true or false, or so for each ego, got {short(value, 60)}")
-    return flags
+    return shares
 
 
 _NAMED: dict[type, OutcomeKeys] = {}

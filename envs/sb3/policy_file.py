@@ -173,6 +173,19 @@ def read_note(path: Path) -> dict[str, Any]:
     return {key: value for key, value in _note(path).items() if key not in (_POLICY_KEY, _ALGORITHM_KEY)}
 
 
+def selection_return(best: Path) -> float:
+    """Returns the mean return on the selection seeds that a kept model had; minus infinity without a file.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    try:
+        found: float = read_note(best).get("selection_return", -math.inf)
+    except zipfile.BadZipFile as error:
+        raise UserError(f"{best} is damaged; remove it to go on without it") from error
+    return found
+
+
 def read_policy_note(path: Path) -> PolicyNote | None:
     """Returns the note of a policy; None for a zip without one (saved by SB3 alone or by an old version).
 

@@ -124,14 +124,14 @@ def _differences(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> tuple[
 
 
 def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: int) -> None:
-    """Checks that the stores from `cut` on hold no episode of those before, and no branch of one."""
-    played = [{p for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
+    """Checks that no store from `cut` on plays a seed of those before, with whatever driver: they begin alike."""
+    played = [{p[:2] for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
     for path, theirs in zip(paths[cut:], played[cut:], strict=True):
         for trained, ours in zip(paths[:cut], played[:cut], strict=True):
             if both := ours & theirs:
                 raise UserError(
                     f"{path} (val_data) plays {len(both)} of the episodes of {trained}: the same environment and "
-                    f"seeds, such as {min(seed for _, seed, _ in both)}; collect it with another --seed, or leave "
+                    f"seeds, such as {min(seed for _, seed in both)}; collect it with another --seed, or leave "
                     "val_data out"
                 )
 

@@ -97,6 +97,21 @@ def test_large_films_are_linked_and_what_is_no_film_has_no_still(tmp_path: Path,
     assert "The worst episode of an evaluation whose results are no longer beside it." in page and "poster" not in page
 
 
+def test_films_beyond_the_most_are_counted_and_those_of_the_evaluation_come_first(tmp_path: Path):
+    run = a_run(tmp_path)
+    (run / "evaluation").mkdir()
+    names = ["evaluation/best.mp4", "evaluation/worst.mp4", *(f"watch-{i}.mp4" for i in range(6))]
+    for name in names[:6]:
+        (run / name).write_bytes(b"no film at all")
+    assert "more films" not in page_of(run)
+    for name in names[6:]:
+        (run / name).write_bytes(b"no film at all")
+    page = page_of(run)
+    captions = re.findall(r"The (best|worst) episode|An (episode) of the policy", page)
+    assert [first or second for first, second in captions] == ["best", "worst", *4 * ["episode"]]
+    assert "2 more films are in the folder." in page
+
+
 @pytest.mark.slow
 def test_a_film_is_captioned_with_the_episode_of_the_evaluation_beside_it(tmp_path: Path):
     """The run's table may be of another evaluation."""
@@ -177,6 +192,8 @@ def test_what_is_not_shown_is_counted(tmp_path: Path):
 
 BEGUN = {"env_id": "x", "first_seed": 0, "has_ego": True}
 """Beginning of a summary."""
+PLAYED = {"p": [{"seed": 0, "episode_return": 1.0, "length": 3, "crashed": False, "mean_speed_mps": 20.0}]}
+"""Episodes of a summary."""
 
 
 @pytest.mark.parametrize(
@@ -187,6 +204,12 @@ BEGUN = {"env_id": "x", "first_seed": 0, "has_ego": True}
         ("summary.json", {**BEGUN, "episodes": {"p": []}}, "episodes.p has no episode"),
         ("summary.json", {**BEGUN, "env_id": 3, "episodes": {"p": [{"seed": 1}]}}, "key 'episode_return' is"),
         ("curve.json", [{"steps": 3}], "key 'return' is missing"),
+        ("curve.json", [{"steps": 3, "return": -1e308}], "return must be at most 1e+30 in size, got -1e+308"),
+        ("summary.json", {**BEGUN, "episodes": PLAYED, "env_kwargs": "[1]"},
+         "summary.json: env_kwargs: env_kwargs must be a JSON object, got '[1]'"),
+        ("config.json", {"config": {**RUN, "env_kwargs": "{"}}, "config.json: env_kwargs: env_kwargs must be a JSON"),
+        ("config.json", {"config": {**RUN, "env_kwargs": 3}}, "config.json: env_kwargs: env_kwargs must be a text"),
+        ("config.json", {"config": RUN, "provenance": {}}, "config.json: provenance must be an array, got {}"),
         ("config.json", {"config": {"steps": 3}}, "is the config of neither train_policy.py nor predictor.train"),
         ("config.json", {"config": RUN, "provenance": [3]}, "provenance must be a JSON object, got 3"),
     ],

@@ -233,6 +233,21 @@ def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], Eg
         make_ppo().learn(8, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=8))
 
 
+def test_a_damaged_best_model_does_not_become_the_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As after a kill between the last update and the copy; without the file the last model stands for it."""
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: PPOPreset(n_steps=8, batch_size=8, n_epochs=1))
+    training = plan(steps=16, selections=1, selection_episodes=1, selection_envs=1, in_process=True)
+    policy, best = train(training, tmp_path), tmp_path / "best_model.zip"
+    policy.unlink()
+    best.write_bytes(best.read_bytes()[:500])
+    for _ in range(2):
+        with pytest.raises(UserError, match="best_model.zip is damaged; remove it to go on without it"):
+            train(training, tmp_path)
+        assert not policy.exists()
+    best.unlink()
+    assert load_model(train(training, tmp_path), "ppo").num_timesteps == 16
+
+
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
 

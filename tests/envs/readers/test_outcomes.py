@@ -49,6 +49,17 @@ def test_of_several_egos_one_may_crash_and_all_must_succeed():
             keys.crashed({"hit": value})
 
 
+def test_shares_of_egos_count_and_other_numbers_are_refused():
+    keys = OutcomeKeys(("hit",), ("done",))
+    assert [keys.crashed({"hit": share}) for share in (0, 0.5, 1)] == [False, True, True]
+    assert [keys.succeeded({"done": share}) for share in (0.0, 0.5, 1.0)] == [False, False, True]
+    for value in (20.5, -1, float("nan"), [0.0, 2.0]):
+        with pytest.raises(UserError, match="info hit must be true or false"):
+            keys.crashed({"hit": value})
+        with pytest.raises(UserError, match="info done must be true or false"):
+            keys.succeeded({"done": value})
+
+
 def test_registered_keys_serve_all_that_derives():
     register_reader(Named, FunctionReader(read_crowd, SPEC), crash_key="outcome.collided", success_key="goal")
     for env in (Named(), Heir(), gym.Wrapper(Heir())):

@@ -259,7 +259,8 @@ def test_no_episode_of_a_store_validates_what_another_trains(circles: Path, tmp_
     recorded = StoreInfo(spec(), "env", {"seed": 0})
     write_store(tmp_path / "train", recorded, [circling_episode(i) for i in range(6)])
     write_store(tmp_path / "other", recorded, [circling_episode(i, steps=7) for i in range(6, 9)])
-    write_store(tmp_path / "val", recorded, [circling_episode(i, steps=7) for i in range(4, 9)])
+    others = [replace(circling_episode(i, steps=7), label="another driver") for i in range(4, 9)]
+    write_store(tmp_path / "val", recorded, others)
     write_store(tmp_path / "elsewhere", replace(recorded, source="another"), [circling_episode(0)])
     begun = replace(config(circles, tmp_path), data=(circles, tmp_path / "train"))
     said = r"val \(val_data\) plays 2 of the episodes of .*train: the same environment and seeds, such as 4; collect it"
