@@ -70,7 +70,7 @@ class PlanMoment:
     risk: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability of a collision within the horizon, by forecaster; the own driver has none."""
     risk_of_planner: dict[str, Float[np.ndarray, " plans"]]
-    """The same with the plan model's margin around every agent, by which the planner chooses."""
+    """Forecast probability with the plan model's margin around every agent, by which the planner chooses."""
 
 
 def play_plans(task: PlanTask) -> list[PlanMoment]:

@@ -56,7 +56,7 @@ class PlanScores:
     right: Estimate | None
     """Share of those pairs in which that plan had the higher risk; equal risks count half."""
     right_of_planner: Estimate | None
-    """The same by the risk with the planner's margin."""
+    """Share of those pairs that the risk with the planner's margin orders so."""
     brier: Estimate | None
     """Mean squared difference of risk and outcome over all plans."""
 
