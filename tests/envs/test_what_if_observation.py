@@ -166,5 +166,5 @@ def test_contacts_know_how_long_a_step_is(monkeypatch: pytest.MonkeyPatch):
     assert lengths == [0.2, 0.2]
     assert env.plans is not None and env.what_if is not None
     assert len(plans_shown(env)) == env.what_if.num_plans and lengths == [0.2] * 3
-    plan_moments._risk(env.what_if, env.scene, replace(env.plans, crashed=None), 0.3)
+    plan_moments._risk(env.what_if, env.scene, replace(env.plans, crashed=None), 0.3, 0.0)
     assert lengths[3:] == [0.3]
