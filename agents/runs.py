@@ -162,7 +162,6 @@ def check_point(point: Mapping[str, Any], where: str) -> None:
         converted(point[name], kind, f"{where}: {name}")
     for name, value in point.items():
         converted(value, float | None, f"{where}: {name}")
-    for name, value in point.items():
         if value is not None and abs(value) > LARGEST:
             raise UserError(f"{where}: {name} must be at most {LARGEST:g} in size, got {value:g}")
     if point["steps"] < 0:

@@ -186,10 +186,8 @@ def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, "
     The choices are by the risk, and by the risk with the planner's margin.
     """
     errors = np.array([[m.without_m[name], m.with_m[name], m.agents] for m in moments])  # moments, parts, branches
-    choices, guarded = (
-        np.sum([right_choices(risk[name], m.crashed[1:]) for m, risk in zip(moments, risks, strict=True)], axis=0)
-        for risks in ([m.risk for m in moments], [m.risk_of_planner for m in moments])
-    )
+    choices = np.sum([right_choices(m.risk[name], m.crashed[1:]) for m in moments], axis=0)
+    guarded = np.sum([right_choices(m.risk_of_planner[name], m.crashed[1:]) for m in moments], axis=0)
     squares = np.sum([[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in moments], axis=0)
     return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, guarded, squares
 
