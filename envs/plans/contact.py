@@ -129,6 +129,7 @@ def _gaps(
         x, y = offset[..., 0], offset[..., 1]
         gap = np.maximum(gap, np.abs(x * along + y * across) - reach_along[..., None])
         gap = np.maximum(gap, np.abs(y * along - x * across) - reach_across[..., None])
+    # absent agents are left out to save time: `contacts` sets their gaps
     fast = (np.hypot(move[..., 0], move[..., 1]) > 2 * INSTANTS * np.minimum(length_m, width_m)) & there
     if fast.any():
         ego_rad = np.broadcast_to(ego_rad, fast.shape)
@@ -169,8 +170,8 @@ def _least_gap(
     one, other = np.triu_indices(value.shape[1], k=1)
     faster = slope[:, one] - slope[:, other]
     behind = value[:, other] - value[:, one]
-    crossings = np.divide(behind, faster, out=np.zeros_like(behind), where=faster != 0).clip(0.0, 1.0)
-    when = np.concatenate([crossings, np.ones((len(value), 1))], -1)  # parallel lines give the beginning
+    # parallel lines give the beginning; lines that cross before or after the step give its ends
+    when = np.divide(behind, faster, out=np.zeros_like(behind), where=faster != 0).clip(0.0, 1.0)
     gaps: Float[np.ndarray, "some times"] = (value[:, None] + when[..., None] * slope[:, None]).max(-1)
     least: Float[np.ndarray, " some"] = gaps.min(-1)
     return least
