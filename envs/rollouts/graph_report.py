@@ -113,8 +113,9 @@ def write_picture(out: Path, result: EnvGraph) -> None:
     models = [name for name in result.scores if name not in RULES]
     colors = RULES | {name: look["color"] for name, look in zip(models, looks_of(models), strict=True)}
     for name, found in result.scores.items():
-        plot_curve(left, name, found, colors[name])
-        plot_calibration(right, name, found, colors[name])
+        line = "--" if name in RULES else "-"  # a checkpoint may have the colour of a rule
+        plot_curve(left, name, found, colors[name], line)
+        plot_calibration(right, name, found, colors[name], line)
     right.plot([0, 1], [0, 1], color="0.8", lw=0.8, zorder=0)
     for ax, x, y in ((left, "recall", "precision"), (right, "probability of an edge", "share of causal edges")):
         ax.set(xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
@@ -123,23 +124,23 @@ def write_picture(out: Path, result: EnvGraph) -> None:
     save_figure(figure, out / f"{result.env_id.replace('/', '-')}.graph.png", 130)
 
 
-def plot_curve(ax: Axes, name: str, found: CausalScores, color: str) -> Axes:
+def plot_curve(ax: Axes, name: str, found: CausalScores, color: str, line: str = "-") -> Axes:
     """Plots precision against recall over all bounds, with a mark at the rule's own bound."""
     if name != MAJORITY and found.curve:
         own = [float("nan") if one is None else one.value for one in (found.recall, found.precision)]
-        ax.plot(own[0], own[1], marker="o", ms=6, color=color, label=name)
+        ax.plot(own[0], own[1], marker="o", ms=6, color=color, ls=line, label=name)
         if len(found.curve) > 2:  # a rule that only says yes or no is one place
-            ax.plot(*zip(*found.curve, strict=True), lw=1.3, color=color)
+            ax.plot(*zip(*found.curve, strict=True), lw=1.3, color=color, ls=line)
     if name == MAJORITY:
         ax.axhline(found.share, color=color, lw=0.8, ls=":", label="share of edges")
     return ax
 
 
-def plot_calibration(ax: Axes, name: str, found: CausalScores, color: str) -> Axes:
+def plot_calibration(ax: Axes, name: str, found: CausalScores, color: str, line: str = "-") -> Axes:
     """Plots the share of edges against the probability, by bin; the area of a mark shows the number of pairs."""
     filled = [(one.mean_prob, one.share, one.pairs) for one in found.bins if one.pairs]
     if filled:
         prob, share, pairs = zip(*filled, strict=True)
-        ax.plot(prob, share, lw=1.0, color=color, label=name)
+        ax.plot(prob, share, lw=1.0, color=color, ls=line, label=name)
         ax.scatter(prob, share, s=[8 + 300 * count / found.pairs for count in pairs], color=color, alpha=0.6)
     return ax

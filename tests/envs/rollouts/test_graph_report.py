@@ -1,15 +1,17 @@
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 from rich.console import Console
 
+from envs.rollouts import graph_report
 from envs.rollouts.causal_labels import ON_ROADS
 from envs.rollouts.graph_report import as_json, markdown, plot_calibration, plot_curve, shown, write_picture
-from envs.rollouts.graph_run import DISTANCE, MAJORITY, EnvGraph
+from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, score_rule
 
 EXISTS = np.tile([True, False, False, False], 20)
@@ -85,6 +87,17 @@ def test_calibration_leaves_out_empty_bins():
     filled = [(one.mean_prob, one.share) for one in MODEL.bins if one.pairs]
     np.testing.assert_array_equal(line.get_xydata(), filled)
     assert len(plot_calibration(plt.figure().subplots(), DISTANCE, SCORES[DISTANCE], "black").get_lines()) == 0
+
+
+def test_no_two_lines_of_a_picture_look_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With as many checkpoints as have colours of their own, one has the colour of a rule."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(graph_report, "save_figure", lambda figure, *_: drawn.append(figure))
+    scores = {f"run {i}": MODEL for i in range(5)} | {DISTANCE: MODEL, LEADERS: MODEL}
+    write_picture(tmp_path, replace(RESULT, scores=scores))
+    for ax in drawn[0].axes:
+        looks = [(line.get_color(), line.get_linestyle()) for line in ax.get_lines() if line.get_label()[0] != "_"]
+        assert len(looks) == len(set(looks)) == len(scores)
     plt.close("all")
 
 
