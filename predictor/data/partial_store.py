@@ -140,9 +140,9 @@ class PartialStore:
         if found == self._settings:
             return
         if not discard:
-            other = [name for name in self._settings if found.get(name) != self._settings[name]]
+            other = ", ".join(_different(found, self._settings)) if found else "settings that cannot be read"
             raise UserError(
-                f"{self.folder} has episodes of an unfinished recording with another {', '.join(other) or 'setting'}; "
+                f"{self.folder} has episodes of an unfinished recording that differs in {other}; "
                 "repeat its command to go on, or pass --overwrite to begin anew"
             )
         delete_folder(self.folder)
@@ -163,6 +163,18 @@ class PartialStore:
             part.mkdir()
         self.num_done += self._added
         self._new, self._added = [], 0
+
+
+def _different(found: dict[str, Any], settings: dict[str, Any]) -> list[str]:
+    """Returns the names of the settings that differ in `found`; of a group also those within: "versions (torch)"."""
+    names = []
+    for name in [*settings, *sorted(found.keys() - settings.keys())]:
+        before, now = found.get(name), settings.get(name)
+        if before != now and isinstance(before, dict) and isinstance(now, dict):
+            names.append(f"{name} ({', '.join(_different(before, now))})")
+        elif before != now:
+            names.append(name)
+    return names
 
 
 def _steps(part: Path) -> int:

@@ -110,7 +110,7 @@ def test_a_recording_does_not_go_on_with_a_driver_or_environment_that_has_change
         assert run_command(collect.main, words, stopping, capsys)[0] == 130
     monkeypatch.setattr(collect, part, lambda name: "after")
     code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
-    assert code == 2 and f"unfinished recording with another {setting}; repeat its command" in errors[0]
+    assert code == 2 and f"unfinished recording that differs in {setting}; repeat its command" in errors[0]
 
 
 def test_what_the_reader_says_of_its_scenes_is_a_setting_of_a_recording():

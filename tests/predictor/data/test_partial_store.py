@@ -1,3 +1,4 @@
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import pytest
 from predictor.data.partial_store import SETTINGS, PartialStore, beside
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
+from predictor.support.files import write_json
 from tests.predictor.helpers import circling_episode, spec
 
 INFO = StoreInfo(spec(), "circle")
@@ -57,8 +59,18 @@ def test_a_short_recording_leaves_no_parts(tmp_path: Path):
 
 def test_parts_with_other_settings_are_named_or_discarded(tmp_path: Path):
     stopped(tmp_path / "store", 2)
-    with pytest.raises(UserError, match="unfinished recording with another seed; repeat its command to go on"):
+    with pytest.raises(UserError, match="unfinished recording that differs in seed; repeat its command to go on"):
         PartialStore(tmp_path / "store", {**SETTINGS_A, "seed": 1})
+    versions = {"versions": {"numpy": "2"}}
+    for found, differs in (
+        ({"numpy": "2"}, "versions"),
+        (versions, "versions (torch, numpy)"),
+        ({}, "settings that cannot"),
+    ):
+        write_json(tmp_path / ".store.unfinished" / SETTINGS, found)
+        with pytest.raises(UserError, match=re.escape(f"differs in {differs}")):
+            PartialStore(tmp_path / "store", {"versions": {"torch": "3"}})
+    write_json(tmp_path / ".store.unfinished" / SETTINGS, SETTINGS_A)
     assert PartialStore(tmp_path / "store", SETTINGS_A, discard=True).num_done == 2
     assert PartialStore(tmp_path / "store", {**SETTINGS_A, "seed": 1}, discard=True).num_done == 0
     assert list(tmp_path.iterdir()) == []
