@@ -130,7 +130,7 @@ class TrainConfig:
     max_episodes: int = 0
     """Number of episodes taken from each training store, the first ones; 0 takes all."""
     val_fraction: float = 0.1
-    """Share of episodes held out for model selection."""
+    """Share of episodes held out for model selection; of recordings, where the store is stretches of these."""
     val_windows: int = 1500
     """Number of held-out windows measured for model selection."""
     eval_every: int = 250

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from predictor.data.causal_edges import with_causal_edges
 from predictor.data.device_windows import with_agents
@@ -71,8 +72,8 @@ def load_data(config: TrainConfig) -> TrainingData:
         return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part], notes)
     train, val, episodes, splits = [], [], [], []
     for store in stores:
-        group = siblings(store.episodes)
-        parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
+        group = _kept_together(store, config.val_fraction)
+        parts = split_episodes(int(group.max()) + 1, config.val_fraction, config.seed)
         splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
     # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
     held = [{_played(store, i) for i in held_out} for store, (_, held_out) in zip(stores, splits, strict=True)]
@@ -89,6 +90,19 @@ def load_data(config: TrainConfig) -> TrainingData:
         val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
         episodes += chosen_here
     return TrainingData(spec, sources, train, val, episodes, notes)
+
+
+def _kept_together(store: EpisodeStore, val_fraction: float) -> Int[np.ndarray, " episodes"]:
+    """Returns a number for each episode that those share which stay on one side of the split.
+
+    These are the branches of an episode and, of data read from files, the stretches of one recording: the same agents
+    moments later. Where there are too few recordings to hold out a share of them, stretches count on their own.
+    """
+    if "source_files" in store.info.provenance:
+        names, recording = np.unique([episode.label for episode in store.episodes], return_inverse=True)
+        if split_episodes(len(names), val_fraction, 0)[1]:
+            return recording
+    return siblings(store.episodes)
 
 
 def _played(store: EpisodeStore, number: int) -> tuple[str, int, str] | None:

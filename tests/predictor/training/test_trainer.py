@@ -270,6 +270,28 @@ def test_no_episode_of_a_store_validates_what_another_trains(circles: Path, tmp_
     assert len(data.val) == 2 and len(data.train_episodes) == 12
 
 
+@pytest.mark.parametrize("recordings", [6, 5])
+def test_stretches_of_one_recording_stay_on_one_side_of_the_split(recordings: int, circles: Path, tmp_path: Path):
+    """With five recordings a tenth is none, so that stretches are held out."""
+    labels = [f"video {i % recordings}" for i in range(4 * recordings)]
+    stretches = [replace(circling_episode(i), label=label, seed=i) for i, label in enumerate(labels)]
+    write_store(tmp_path / "read", StoreInfo(spec(), "videos", {"source_files": recordings}), stretches)
+    write_store(tmp_path / "made", StoreInfo(spec(), "videos"), stretches)
+    for seed in range(4):
+        trained, made = (
+            load_data(
+                replace(config(circles, tmp_path), data=(tmp_path / name,), seed=seed, val_fraction=0.1)
+            ).train_episodes
+            for name in ("read", "made")
+        )
+        held = set(range(len(labels))) - {episode.seed for episode in trained}
+        assert len(made) == 4 * recordings - 2
+        if recordings == 6:
+            assert len({labels[i] for i in held}) == 1 and len(held) == 4
+        else:
+            assert [e.seed for e in trained] == [e.seed for e in made] and len(held) == 2
+
+
 def test_stores_that_differ_in_frame_or_range_are_named(circles: Path, tmp_path: Path):
     near = replace(spec(), perception_m=7.5)
     write_store(tmp_path / "near", StoreInfo(near, "near"), [circling_episode(i) for i in range(6)])
