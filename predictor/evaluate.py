@@ -1,8 +1,8 @@
 """Measures a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the episodes), miss rate, coverage,
-and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
-(K samples); writes JSON, Markdown and plots. For accuracy in live environments, run
+and RMSE and NLL by horizon, of K samples (ADE and FDE of the single forecast as well), beside constant velocity, which
+has noise if K is above 1; writes JSON, Markdown and plots. For accuracy in live environments, run
 `python -m envs.evaluate`.
 """
 
@@ -21,7 +21,7 @@ from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
-from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows, windows_per_forward
+from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.forecaster import Forecaster
 from predictor.reports.looks import STYLE
 from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
@@ -172,14 +172,14 @@ def _plot(
     figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
     plot_error_by_horizon(ax, accuracies, windows.spec.dt_s)
     save_figure(figure, config.out / "error_by_horizon.png", 130)
-    batch = windows.batch(chosen[:200])
-    device = torch.device("cpu" if isinstance(model, ConstantVelocity) else config.device)
-    outcome: Outcome = run_window_batch(
-        model, batch.to(device), horizon, min(config.num_samples, 10), torch.Generator(device).manual_seed(config.seed)
-    )
-    busiest = torch.argsort(outcome.valid.cpu().all(-1).sum(-1), descending=True)[:4].tolist()
+    device = "cpu" if isinstance(model, ConstantVelocity) else config.device
+    shown = chosen[:200]
+    (seen,) = run_windows(ConstantVelocity(windows.spec), windows, shown, horizon, batch_size=len(shown))
+    busiest = shown[torch.argsort(seen.valid.all(-1).sum(-1), descending=True, stable=True)[:4].numpy()]
+    samples, batch = min(config.num_samples, 10), windows.batch(busiest)
+    (outcome,) = run_windows(model, windows, busiest, horizon, samples, config.seed, len(busiest), device)
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
-    for ax, window in zip(axes.flat, busiest, strict=False):
+    for window, ax in zip(range(len(busiest)), axes.flat, strict=False):
         past = slice(0, int(batch.last_observed[window]) + 1)
         plot_scene(
             ax,

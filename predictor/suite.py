@@ -358,7 +358,7 @@ def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) ->
     dt_s = read_info_of(config.data / TABLES[config.table].tests[kinds[0]]).spec.dt_s
     seeds = "one seed" if config.seeds == 1 else f"mean over {config.seeds} seeds"
     headline = f"{title}, budget {config.budget}, {seeds}"
-    figure = figure_by_step(results, kinds, dt_s, f"{headline}; bars: standard error over 20 subsets")
+    figure = figure_by_step(results, kinds, dt_s, f"{headline}; bars: standard error over test episodes")
     save_figure(figure, config.folder / "by_step.png", 110)
 
 

@@ -149,14 +149,17 @@ def _rollout(trial: Trial) -> Iterator[str]:
 
 def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: Trial) -> Iterator[str]:
     probs, scale = futures.mode_probs, futures.scale
+    there = trial.valid[:, None].expand(-1, wanted[1], -1)  # of absent agents nothing is read
     if probs is not None and tuple(probs.shape) != wanted[:3]:
         yield f"rollout: mode_probs must have the shape {wanted[:3]}, got {tuple(probs.shape)}"
-    elif probs is not None and bool(((probs.sum(1) - 1).abs() > 1e-3).any() or (probs < 0).any()):
+    elif probs is not None and not bool(
+        (((probs.sum(1) - 1).abs() <= 1e-3) | ~trial.valid).all() and (probs[there] >= 0).all()
+    ):
         yield "rollout: mode_probs must sum to 1 over the samples of each agent"
     shape = (*wanted[:4], trial.spec.position_dim)
     if scale is not None and tuple(scale.shape) != shape:
         yield f"rollout: scale must have the shape {shape}, got {tuple(scale.shape)}"
-    elif scale is not None and not bool(((scale >= 0) & torch.isfinite(scale)).all()):
+    elif scale is not None and not bool(((scale >= 0) & torch.isfinite(scale))[there].all()):
         yield "rollout: scale is a standard deviation [m]; it must be finite and not negative"
 
 

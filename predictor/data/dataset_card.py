@@ -1,6 +1,6 @@
 """Writes the store and the data card of a dataset together; the card holds what was measured on the episodes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,6 +39,7 @@ def save_dataset(
     notes: DatasetNotes,
     files: Iterable[Path],
     extra: Mapping[str, object] | None = None,
+    recording: Callable[[str], str] = str,
 ) -> None:
     """Writes the store and, beside it, its data card; either both are complete or nothing is left.
 
@@ -49,17 +50,22 @@ def save_dataset(
         notes: facts for the card.
         files: files that were read, for the checksum.
         extra: additional provenance.
+        recording: gives the name of the recording from an episode's label; training keeps its episodes on one side of a
+            split, since they hold the same agents, moments later.
 
     Raises:
         UserError: no episodes, or the output exists and may not be replaced.
     """
     check_not_empty(config, episodes, notes)
     read = list(files)
+    names = [recording(episode.label) for episode in episodes]
+    number = {name: i for i, name in enumerate(dict.fromkeys(names))}
     facts = provenance(("numpy", "zarr")) | {
         "source_sha256": checksum(config.source, read),
         "source_files": len(read),
         "split": config.split,
         "counts": dict(notes.counts),
+        "recordings": [number[name] for name in names],
         "rights": notes.rights,
         **(extra or {}),
     }

@@ -87,20 +87,21 @@ def bytes_needed(windows: Sequence[Windows]) -> int:
     return sum(w.flat.num_bytes + w.index.nbytes for w in windows)
 
 
-def window_sizes(windows: Windows) -> Int[np.ndarray, " windows"]:
-    """Returns the number of agents of each window, with the longest history.
+def window_sizes(windows: Windows, chosen: Int[np.ndarray, " windows"] | None = None) -> Int[np.ndarray, " windows"]:
+    """Returns the number of agents of the chosen windows (None: of all), with the longest history.
 
     Raises:
         UserError: an ego is missing at an observed step.
     """
-    flat = windows.flat
+    flat, index = windows.flat, windows.index if chosen is None else windows.index[chosen]
     if not windows.spec.has_ego and flat.visible[:-1].all():  # a fixed cast
-        return flat.columns.numpy()[windows.index[:, 0]]
-    step = max(1, _CHUNK // (windows.history_steps * max(1, int(flat.columns.max()))))
+        return flat.columns.numpy()[index[:, 0]]
+    history = min(windows.history_steps, int(flat.steps.max()))
+    step = max(1, _CHUNK // (history * max(1, int(flat.columns.max()))))
     sizes = []
-    for begin, end in pairwise([*range(0, len(windows), step), len(windows)]):
-        episode, now = (torch.from_numpy(column) for column in windows.index[begin:end].T.copy())
-        sizes.append(windows.cast(episode, now, windows.history_steps).size.numpy())
+    for begin, end in pairwise([*range(0, len(index), step), len(index)]):
+        episode, now = (torch.from_numpy(column) for column in index[begin:end].T.copy())
+        sizes.append(windows.cast(episode, now, history).size.numpy())
     return np.concatenate(sizes)
 
 

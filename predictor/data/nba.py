@@ -16,6 +16,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -294,9 +295,9 @@ def scene_spec() -> SceneSpec:
     )
 
 
-def game_of(path: Path, format: str) -> str:
-    """Returns the game of a file; text files are named HOME_VISITOR_GAME_QUARTER_START_END."""
-    return "_".join(path.stem.split("_")[:3]) if format == "score" else path.stem
+def game_of(name: str, format: str) -> str:
+    """Returns the game of a file or label: HOME_VISITOR_GAME_QUARTER_START_END (text files), GAME/passage (SportVU)."""
+    return "_".join(name.split("_")[:3]) if format == "score" else name.partition("/")[0]
 
 
 def episodes_of(passage: Passage, episode_steps: int) -> list[Episode]:
@@ -328,9 +329,9 @@ def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
         UserError: a file is broken, unless `skip_broken`.
     """
     files = find_files(config.source, PATTERNS[config.format], f"files of format '{config.format}'")
-    chosen = [path for path in files if in_split(game_of(path, config.format), config.split, SPLIT_SEED)]
+    chosen = [path for path in files if in_split(game_of(path.stem, config.format), config.split, SPLIT_SEED)]
     counts: Counter[str] = Counter({"files": len(files), f"files of split '{config.split}'": len(chosen)})
-    counts["games"] = len({game_of(path, config.format) for path in chosen})
+    counts["games"] = len({game_of(path.stem, config.format) for path in chosen})
     episodes: list[Episode] = []
     for path in track(chosen, "nba"):
         for passage in _passages(path, config, counts):
@@ -382,7 +383,7 @@ def main() -> None:
     config = parse(NbaConfig, __doc__)
     config.check_paths()
     episodes, notes, files = load(config)
-    save_dataset(config, scene_spec(), episodes, notes, files)
+    save_dataset(config, scene_spec(), episodes, notes, files, recording=partial(game_of, format=config.format))
     print(summary(config, episodes))
 
 

@@ -261,7 +261,8 @@ def parts_of(config: TracksConfig) -> list[Part]:
     if not folders:
         config.check_paths()
         files = tuple(find_files(config.source, config.pattern, "files of tracks"))
-        return [Part(config, files, tuple(path for path in files if in_split(path.stem, config.split, SPLIT_SEED)))]
+        chosen = [path for path in files if in_split(label_of(path, config.source), config.split, SPLIT_SEED)]
+        return [Part(config, files, tuple(chosen))]
     if config.split not in ("all", *folders):
         raise UserError(f"{config.source} has the folders {', '.join(folders)}, no {config.split}; leave out --split")
     check_out(config.out, only_stores=True)
@@ -303,12 +304,18 @@ def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
         episodes: list[Episode] = []
         for path in part.chosen:
             points = points_of(recordings[path], frame_step, part.config, found)
-            episodes += cut_episodes(points, part.config.episode_steps or _whole_length(points), path.stem, found)
+            label = label_of(path, part.config.source)
+            episodes += cut_episodes(points, part.config.episode_steps or _whole_length(points), label, found)
         numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
         notes = _notes(part.config, frame_step, found)
         check_not_empty(part.config, numbered, notes)
         loaded.append((numbered, notes))
     return loaded
+
+
+def label_of(path: Path, source: Path) -> str:
+    """Returns what a recording is called: its path in the source, which may be the file itself, without the suffix."""
+    return path.relative_to(source).with_suffix("").as_posix() if path != source else path.stem
 
 
 def _whole_length(points: TrackPoints) -> int:
@@ -323,7 +330,7 @@ def _notes(config: TracksConfig, frame_step: int, counts: Counter[str]) -> Datas
     return DatasetNotes(
         f"Tracks, {title}",
         "Positions of agents by frame, read from text files. An agent's id is that of the file; a label is the "
-        "file's name.",
+        "file's path in the source, without its suffix.",
         RIGHTS,
         (
             f"Columns {', '.join(map(str, config.columns))} are frame, id, x and y; one unit is {config.scale:g} m.",

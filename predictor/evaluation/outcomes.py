@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from predictor.data.device_windows import window_sizes
 from predictor.data.windows import WindowBatch, Windows
 from predictor.forecaster import Belief, Forecaster
 from predictor.noise import Noise
@@ -186,10 +187,8 @@ def run_windows(
 
 def windows_per_forward(windows: Windows, indices: Int[np.ndarray, " some"], samples: int) -> int:
     """Returns the number of windows in one forward, by the largest of them, so that memory is bounded."""
-    episode, now = (torch.from_numpy(column) for column in windows.index[indices].T.copy())
-    longest = int(windows.flat.steps.max())
-    agents = int(windows.cast(episode, now, min(windows.history_steps, longest)).size.max())
-    return max(1, min(256, MOST_PAIRS // (agents**2 * samples)))
+    agents = int(window_sizes(windows, indices).max())
+    return max(1, min(256, MOST_PAIRS // max(1, agents**2 * samples)))
 
 
 def noise_of_windows(indices: Int[np.ndarray, " some"], seed: int) -> list[np.random.Generator]:

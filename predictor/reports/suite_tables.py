@@ -65,7 +65,7 @@ def markdown_report(content: dict[str, Any]) -> str:
         UserError: lines differ in K.
     """
     sizes, seeds = content["sizes"], content["seeds"]
-    spread = "Mean ± standard error over 20 random subsets of the test episodes"
+    spread = "Mean ± standard error over 20 random subsets of the test episodes (of fewer, over these)"
     if seeds > 1:
         others = spread[0].lower() + spread[1:]
         spread = f"Trained lines: mean over {seeds} training seeds (lowest to highest). Others: {others}"

@@ -147,6 +147,8 @@ def _dimension_table(content: dict[str, Any], scores: Sequence[dict[str, Any]]) 
 def _stillness_note(content: dict[str, Any]) -> str:
     whole, late = content["stillness"], content["stillness_late"]
     which = "true edges" if content["edges"] is not None else "pairs"
+    if whole["steps"] < 2:
+        return "changing, static and spread: with one observed step there is no change to measure."
     return (
         f"changing: variance within a pair over time / variance over pairs and time; 0 is static, 1 is all change. "
         f"Over all {whole['steps']} observed steps ({whole['edges']} {which} present at all of them), and over the "

@@ -181,12 +181,10 @@ class TrainConfig:
             "min_history_steps", "max_episodes", "reaction_weight", "shift_weight",
         )  # fmt: skip
         check_at_most(self, MOST_THREADS, "threads")
-        if self.shift_weight and not self.rollout_weight:
-            raise UserError("shift_weight compares roll-outs, and rollout_weight is 0; leave one of them out")
-        if self.only_spread and not self.rollout_weight:
-            raise UserError(
-                "only_spread trains the spread of roll-outs, and rollout_weight is 0; leave one of them out"
-            )
+        of_rollouts = ("shift_weight", "reaction_weight", "curriculum_steps", "only_spread")
+        without = [name for name in of_rollouts if getattr(self, name) and not self.rollout_weight]
+        if without:
+            raise UserError(f"{without[0]} is of roll-outs, and rollout_weight is 0; leave one of them out")
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]

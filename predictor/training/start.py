@@ -54,10 +54,12 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     Raises:
         UserError: as `model_config`; or the checkpoint cannot be read, is of another model or network, or its scenes
             have other features, or an ego where the data's have none, or none where the data's have one; or only its
-            spread shall be trained, and it has none, or another horizon.
+            spread shall be trained, and it has none, or another horizon; or modes would not learn.
     """
     if not config.init:
-        return build(config.model, spec, model_config(config, spec, episodes), config.horizon_steps)
+        network = model_config(config, spec, episodes)
+        _check_modes(config, network)
+        return build(config.model, spec, network, config.horizon_steps)
     source, info = load_checkpoint(config.init)
     if info.model != config.model:
         raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
@@ -68,6 +70,7 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
             fitted = model_config(replace(config, set=(f"residual={info.config.residual}",)), spec, episodes)
             source = rescaled(source, info.model, {name: getattr(fitted, name) for name in SCALES}, info.horizon_steps)
         network = changed(replace(source.config, **_labels(config, episodes)), config.set)
+        _check_modes(config, network)
         plain = build(info.model, spec, network, config.horizon_steps)
         _fill(plain, source, config)
         return plain
@@ -86,6 +89,16 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     model.self_edges.spread.requires_grad_(True)
     of_types.requires_grad_(True)
     return model
+
+
+def _check_modes(config: TrainConfig, network: Any) -> None:
+    """Checks that the modes of a network, where it has them, can learn.
+
+    Raises:
+        UserError: the training has no roll-outs.
+    """
+    if getattr(network, "num_modes", 0) and not config.rollout_weight:
+        raise UserError("modes learn from roll-outs, and rollout_weight is 0; pass --preset fast, or a weight")
 
 
 def _fill(model: nn.Module, source: nn.Module, config: TrainConfig) -> None:

@@ -83,7 +83,7 @@ def load_data(config: TrainConfig) -> TrainingData:
         if not kept or not held_out:
             raise UserError(
                 f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
-                f"{len(held_out)} for validation; both need at least one, so collect more"
+                f"{len(held_out)} for validation; both need at least one, so collect more, or change --val-fraction"
             )
         chosen_here = [store.episodes[i] for i in kept]
         train.append(_windows(config, chosen_here, spec, validation=False))
@@ -98,17 +98,17 @@ def _kept_together(store: EpisodeStore, val_fraction: float) -> Int[np.ndarray, 
     These are the branches of an episode and, of data read from files, the stretches of one recording: the same agents
     moments later. Where there are too few recordings to hold out a share of them, stretches count on their own.
     """
-    if "source_files" in store.info.provenance:
-        names, recording = np.unique([episode.label for episode in store.episodes], return_inverse=True)
+    recordings = store.info.provenance.get("recordings")
+    if isinstance(recordings, list) and len(recordings) == len(store.episodes):
+        names, recording = np.unique([str(name) for name in recordings], return_inverse=True)
         if split_episodes(len(names), val_fraction, 0)[1]:
             return recording
     return siblings(store.episodes)
 
 
-def _played(store: EpisodeStore, number: int) -> tuple[str, int, str] | None:
-    """Returns which episode of which environment it is, as are its branches; None where seeds only number episodes."""
-    episode = store.episodes[number]
-    return (store.info.source, episode.seed, episode.label) if "seed" in store.info.provenance else None
+def _played(store: EpisodeStore, number: int) -> tuple[str, int] | None:
+    """Returns the environment and seed, which say how an episode begins; None where seeds only number episodes."""
+    return (store.info.source, store.episodes[number].seed) if "seed" in store.info.provenance else None
 
 
 def _check_alike(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> None:
@@ -138,8 +138,8 @@ def _differences(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> tuple[
 
 
 def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: int) -> None:
-    """Checks that no store from `cut` on plays a seed of those before, with whatever driver: they begin alike."""
-    played = [{p[:2] for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
+    """Checks that no store from `cut` on plays a seed of those before."""
+    played = [{p for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
     for path, theirs in zip(paths[cut:], played[cut:], strict=True):
         for trained, ours in zip(paths[:cut], played[:cut], strict=True):
             if both := ours & theirs:

@@ -37,6 +37,7 @@ from predictor.evaluation.outcomes import run_window_batch
 from predictor.forecaster import Belief, Memory
 from predictor.interpret import InterpretConfig, interpret
 from predictor.reports import edge_plots as pictures
+from predictor.reports.tables import _stillness_note
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import RICH, circling_episode, model, spec, write_circles
@@ -651,3 +652,10 @@ def test_the_longest_window_that_fits_is_watched(monkeypatch: pytest.MonkeyPatch
     assert (found.windows, found.episodes, found.stillness.steps) == (12, 12, 7)
     with pytest.raises(UserError, match="a window needs 11"):
         interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 20, 7, 4, num_samples=1))
+
+
+def test_one_observed_step_shows_no_change():
+    content = {"stillness": {"steps": 1}, "stillness_late": {}, "edges": None}
+    assert (
+        _stillness_note(content) == "changing, static and spread: with one observed step there is no change to measure."
+    )

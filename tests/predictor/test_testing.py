@@ -296,6 +296,18 @@ def test_nothing_is_found_where_nothing_is_wrong(frame: Any):
     check_forecaster(NoisyConstantVelocity(There.spec, 1.0, 1.0))
 
 
+def test_what_is_said_of_absent_agents_does_not_count():
+    class Absent(Smooth):
+        def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+            states = super().rollout(belief, *arguments, **named).states
+            there = belief.valid[:, None].expand(states.shape[:3])
+            nothing = torch.full(states.shape[:3], float("nan"))
+            scale = torch.where(there[..., None, None], 1.0, nothing[..., None, None]).expand(*states.shape[:4], 2)
+            return Futures(states, torch.where(there, 1 / states.shape[1], nothing), scale)
+
+    check_forecaster(Absent())
+
+
 def test_a_frame_that_is_not_kept_is_found():
     class Somewhere(Smooth):
         spec = SceneSpec(dt_s=0.1, frame=("centroid", "centroid"), has_ego=False)

@@ -722,8 +722,11 @@ def test_the_best_or_the_last_weights_are_kept(
 def test_shifts_need_twins(tiny: None, circles: Path, tmp_path: Path):
     with pytest.raises(UserError, match="shift_weight needs branches with twins, got none; collect a store with --br"):
         train(config(circles, tmp_path / "run", shift_weight=3.0))
-    with pytest.raises(UserError, match="shift_weight compares roll-outs, and rollout_weight is 0"):
-        config(circles, tmp_path / "run", shift_weight=3.0, rollout_weight=0.0)
+    with pytest.raises(UserError, match="modes learn from roll-outs, and rollout_weight is 0; pass --preset"):
+        train(config(circles, tmp_path / "run", rollout_weight=0.0, preset="plural"))
+    for name in ("shift_weight", "reaction_weight", "curriculum_steps"):
+        with pytest.raises(UserError, match=f"{name} is of roll-outs, and rollout_weight is 0; leave one of them out"):
+            config(circles, tmp_path / "run", rollout_weight=0.0, causal_edges=True, **{name: 3})
 
 
 @pytest.mark.slow

@@ -107,6 +107,11 @@ def test_games_are_not_divided(possessions: Path, loader: Loader):
         assert all(split_of(game, nba.SPLIT_SEED) == split for game in games)
         seen += games
     assert sorted(seen) == sorted({f"ATL_BKN_{game}" for game in range(40)})
+    whole = loader.load(possessions, "--episode-steps", 4, "--overwrite")
+    labels = [e.label for e in whole.episodes]
+    number = dict(zip(labels, whole.info.provenance["recordings"], strict=True))
+    assert len(set(number.values())) == len({"_".join(label.split("_")[:3]) for label in labels})
+    assert number["ATL_BKN_7_1_60.0_50.0"] == number["ATL_BKN_7_2_60.0_50.0"] != number["ATL_BKN_8_1_60.0_50.0"]
 
 
 # Line 4 is the ball of frame 0; frame 12 begins at line 12.
@@ -209,6 +214,7 @@ def test_events_overlap_and_play_is_interrupted(games: Path, loader: Loader):
     store = loader.load(games, "--format", "sportvu", "--episode-steps", 4)
     # 13 moments in each passage, 5 kept, 4 velocities.
     assert [e.label for e in store.episodes] == ["7/0", "7/1", "7/2", "7/3"]
+    assert store.info.provenance["recordings"] == [0] * 4
     for line in (
         "| moments read | 58 |",
         "| moments without 1 ball and 10 players | 1 |",

@@ -245,6 +245,17 @@ def test_files_outside_of_folders_are_divided_by_name(source: Path, loader: Load
     assert sorted(found) == sorted(["walk", *(f"video{i}" for i in range(30))])
 
 
+def test_files_of_one_name_in_folders_are_recordings_of_their_own(source: Path, loader: Loader):
+    for i in range(30):
+        (source / f"video{i}").mkdir()
+        (source / f"video{i}" / "tracks.txt").write_text(text_of(WALK))
+    found = []
+    for split in ("train", "val", "test"):
+        words = ("--pattern", "video*/tracks.txt", "--split", split, "--overwrite")
+        found += [e.label for e in loader.load(source, *words).episodes]
+    assert sorted(found) == sorted(f"video{i}/tracks" for i in range(30))
+
+
 def test_one_file_or_another_pattern(source: Path, walk: Path, loader: Loader):
     expected = loader.load(source)
     assert_equal(loader.load(walk, "--overwrite"), expected)

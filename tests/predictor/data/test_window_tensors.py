@@ -155,6 +155,8 @@ def test_sizes_are_those_of_the_windows(drawn: dict[str, Any]):
     windows, episodes, _ = store(drawn)
     sizes = window_sizes(windows)
     assert sizes.shape == (len(windows),)
+    every_other = np.arange(0, len(windows), 2)
+    np.testing.assert_array_equal(window_sizes(windows, every_other), sizes[every_other])
     for window, (episode, now) in enumerate(windows.index.tolist()):
         cut = cut_one(episodes[episode], windows.spec, now, windows.history_steps, windows.horizon_steps)
         assert sizes[window] == len(cut.columns)

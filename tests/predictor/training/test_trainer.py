@@ -268,6 +268,12 @@ def test_no_episode_of_a_store_validates_what_another_trains(circles: Path, tmp_
         load_data(replace(begun, val_data=(tmp_path / "elsewhere", tmp_path / "val")))
     data = load_data(replace(begun, val_data=(tmp_path / "elsewhere", tmp_path / "other")))
     assert len(data.val) == 2 and len(data.train_episodes) == 12
+    for name, count in (("idle", 15), ("random", 12)):
+        driven = [replace(circling_episode(i, steps=4 + len(name)), label=name) for i in range(count)]
+        write_store(tmp_path / name, recorded, driven)
+    trained = load_data(replace(begun, data=(tmp_path / "idle", tmp_path / "random"))).train_episodes
+    idle, random = ({e.seed for e in trained if e.label == label} for label in ("idle", "random"))
+    assert random == idle & set(range(12)) and 0 < len(random) < 8  # 4 of 12 are held out, and others of the 15
 
 
 @pytest.mark.parametrize("recordings", [6, 5])
@@ -275,7 +281,8 @@ def test_stretches_of_one_recording_stay_on_one_side_of_the_split(recordings: in
     """With five recordings a tenth is none, so that stretches are held out."""
     labels = [f"video {i % recordings}" for i in range(4 * recordings)]
     stretches = [replace(circling_episode(i), label=label, seed=i) for i, label in enumerate(labels)]
-    write_store(tmp_path / "read", StoreInfo(spec(), "videos", {"source_files": recordings}), stretches)
+    of_each = [int(label.split()[1]) for label in labels]
+    write_store(tmp_path / "read", StoreInfo(spec(), "videos", {"recordings": of_each}), stretches)
     write_store(tmp_path / "made", StoreInfo(spec(), "videos"), stretches)
     for seed in range(4):
         trained, made = (
@@ -428,7 +435,7 @@ def run(settings: TrainConfig, steps: int, restore: Path | None = None) -> Train
         ({}, "rollout_steps", [3] * 8),
         ({"curriculum_steps": 6}, "rollout_steps", [1, 1, 1, 2, 2, 2, 3, 3]),
         ({"curriculum_steps": 2}, "rollout_steps", [1, 2, 3, 3, 3, 3, 3, 3]),
-        ({"curriculum_steps": 6, "rollout_weight": 0.0}, "rollout_steps", [0] * 8),
+        ({"rollout_weight": 0.0}, "rollout_steps", [0] * 8),
         ({}, "kl_scale", [1.0] * 8),
         ({"kl_warmup_steps": 4}, "kl_scale", [0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0]),
         ({"kl_warmup_steps": 1}, "kl_scale", [1.0] * 8),
@@ -574,7 +581,7 @@ def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
 
 
 def test_only_the_spread_needs_roll_outs_and_a_checkpoint_that_has_one(circles: Path, tmp_path: Path):
-    with pytest.raises(UserError, match="only_spread trains the spread of roll-outs, and rollout_weight is 0"):
+    with pytest.raises(UserError, match="only_spread is of roll-outs, and rollout_weight is 0"):
         config(circles, tmp_path / "second", init="anywhere", only_spread=True, rollout_weight=0.0, horizon_steps=2)
     with pytest.raises(UserError, match="only_spread keeps the network of its checkpoint; leave --set out"):
         config(circles, tmp_path / "second", init="anywhere", only_spread=True, set=("static_dim=1",))
