@@ -223,7 +223,7 @@ class TrainPolicyConfig:
 
     @property
     def measuring_envs(self) -> int:
-        """Number of parallel environments that measure a policy; results do not depend on it."""
+        """Number of parallel environments that measure a policy; results do not depend on it, but for rounding."""
         return min(self.sizes.num_envs, os.cpu_count() or 1)
 
 
@@ -246,7 +246,7 @@ def _kept(config: TrainPolicyConfig) -> str:
 def _run(config: TrainPolicyConfig, console: Console) -> None:
     """Trains, evaluates and films; nothing is written before the input has been checked."""
     plan = config.plan
-    plan.check_action_space(plan.task.check())
+    plan.check_spaces(*plan.task.check())
     settings = asdict(config) | asdict(config.sizes)
     settings |= {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
     # config.json keeps the older names of two options, so that earlier runs can be read and resumed

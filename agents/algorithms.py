@@ -13,7 +13,7 @@ from agents.features import AttentionConfig, ForecastAttention
 from agents.plan_scores import PlanAttention, PlanScores, PlanValues
 from agents.presets import Algorithm, PPOPreset, Preset, RecurrentPPOPreset
 from envs.sb3.algorithms import algorithm_class
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 DISCRETE: tuple[Algorithm, ...] = ("dqn", "qrdqn")
 """Algorithms that need discrete actions."""
@@ -36,6 +36,8 @@ def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> Non
         raise UserError(f"{algorithm} needs a discrete action space, {env_id} has {space}; use ppo")
     if algorithm in CONTINUOUS and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
         raise UserError(f"{algorithm} needs a continuous action space, {env_id} has {space}; use ppo")
+    if isinstance(space, spaces.Box) and not np.issubdtype(space.dtype, np.floating):
+        raise UserError(f"{algorithm} gives actions with a fraction, {env_id} has {space} of whole numbers; wrap it")
     if isinstance(space, spaces.Box) and not space.is_bounded():
         raise UserError(f"{algorithm} needs bounded actions, {env_id} has {space}; give its action space bounds")
     if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
@@ -47,6 +49,24 @@ def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> Non
         raise UserError(f"{algorithm} needs actions in one row, {env_id} has {space}; flatten them")
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and np.any(space.start != 0):
         raise UserError(f"{algorithm} counts actions from 0, {env_id} has {space}; wrap it so that its actions do, too")
+
+
+def check_observations(space: spaces.Space, env_id: str) -> None:
+    """Checks that policies can read an observation space.
+
+    Raises:
+        UserError: they cannot.
+    """
+    for entry in space.spaces.values() if isinstance(space, spaces.Dict) else (space,):
+        numbers = isinstance(entry, spaces.Box) and entry.shape and min(entry.shape) > 0
+        counted = isinstance(entry, spaces.Discrete | spaces.MultiDiscrete) and len(entry.shape or ()) < 2
+        from_zero = counted and not np.any(entry.start)  # type: ignore[attr-defined]
+        if not (numbers or from_zero or isinstance(entry, spaces.MultiBinary)):
+            found = short(" ".join(str(entry).split()), 100)
+            raise UserError(
+                "a policy reads arrays (Box), Discrete and MultiDiscrete that count from 0, MultiBinary, and Dicts of "
+                f"these, {env_id} has {found}; flatten it, in gymnasium with FlattenObservation"
+            )
 
 
 def log_interval(algorithm: Algorithm) -> int:

@@ -16,6 +16,7 @@ from agents.vec_envs import (
     EPISODE_INFO,
     EpisodeResult,
     MakeCopy,
+    check_ends,
     learners_of,
     make_multiagent_venv,
     make_venv,
@@ -102,7 +103,10 @@ def _parts(space: gym.Space) -> Mapping[str, gym.Space]:
 
 
 def _sizes(space: gym.Space) -> Any:
-    return int(space.n) if isinstance(space, gym.spaces.Discrete) else space.shape
+    """Returns what must be equal for a policy to act in a space, or to read it."""
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.n)
+    return space.nvec.tolist() if isinstance(space, gym.spaces.MultiDiscrete) else space.shape
 
 
 def open_arena(task: Task, num_envs: int, in_process: bool | None = None) -> Arena:
@@ -222,6 +226,8 @@ class MultiagentArena:
             for copy in playing:
                 lengths[copy] += 1
             playing = {copy for copy in playing if copies[copy].episodes == episodes[copy]}
+            for copy in playing:
+                check_ends(lengths[copy], self._task.env_id)
         return [_result(seed, lengths[copy], returns[copy]) for copy, seed in enumerate(seeds)]
 
     def _driven(self, name: str, seed: int) -> EpisodeResult:
@@ -232,6 +238,7 @@ class MultiagentArena:
         steps, left = 0, list(env.agents)
         lived = set(left)
         while left and not (lived.issuperset(returns) and returns.keys().isdisjoint(left)):
+            check_ends(steps, self._task.env_id)
             own = own_observations(observations)
             actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
             observations, rewards, terminated, truncated, _ = env.step(env.drive_others(own) | actions)

@@ -68,7 +68,7 @@ def evaluate_policy_on_seeds(
         model: the trained policy, or the name of a driver.
         name: name of the policy in the table.
         num_episodes: number of episodes per policy.
-        num_envs: number of parallel environments; the results do not depend on it.
+        num_envs: number of parallel environments; the results do not depend on it, but for rounding.
         first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
         drivers: names of drivers that are compared beside the arena's baselines ("planner").
@@ -146,7 +146,7 @@ class EvaluateConfig:
     films: bool = False
     """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: int = os.cpu_count() or 1
-    """Number of parallel environments; the results do not depend on it."""
+    """Number of parallel environments; the results do not depend on it, but for rounding of continuous actions."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
     timeout_s: float = TIMEOUT_S
@@ -309,11 +309,13 @@ def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
     named = {None, task.checkpoint}
     if task.sizes_of and (is_own(task.sizes_of) or is_remote(task.sizes_of)):  # `task_of` wants it named to trust it
         named.add(task.sizes_of)
+    pin = task.note.forecaster if task.checkpoint is None and config.checkpoint is not None else None
+    if pin is not None:  # the one that ships for the id
+        named.add(pin.checkpoint)
     if config.checkpoint not in named:
-        raise UserError(
-            f"policy {policy} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
-            "it out"
-        )
+        known = task.checkpoint or (pin.checkpoint if pin else None)
+        seen = f"was trained on forecaster {known}" if known else "sees no forecaster's forecasts"
+        raise UserError(f"policy {policy} {seen}, got --checkpoint {config.checkpoint}; leave it out")
     if config.env_id not in (None, task.env_id):
         raise UserError(f"policy {policy} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     given: dict[str, Any] = {name: getattr(config, name) for name in ("crash_key", "success_key", "env_kwargs")}

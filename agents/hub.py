@@ -89,7 +89,8 @@ def local_policy(path: str | Path, trust_pickle: bool = False) -> Path:
 def card_of(note: PolicyNote, algorithm: str, repository: str) -> str:
     """Returns the card of a policy."""
     pin = note.forecaster
-    sees = "Sees no forecasts." if pin is None else f"Sees forecasts of `{pin.checkpoint}` ({pin.horizon_steps} steps)."
+    shown = "forecasts" if pin is None or pin.arm == "forecast" else f"the arm `{pin.arm}` in the shape of forecasts"
+    sees = "Sees no forecasts." if pin is None else f"Sees {shown} of `{pin.checkpoint}` ({pin.horizon_steps} steps)."
     return (
         f"# Policy of `{note.env_id or 'an environment'}`\n\n{algorithm}, Stable-Baselines3. {sees}\n\n"
         "**The zip holds pickled Python objects: loading it runs code.** Load it only if you trust its source.\n\n"

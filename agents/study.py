@@ -236,13 +236,13 @@ def _write(
     if not results:
         return
     findings, made = Findings.of(study, results), provenance(PACKAGES)
+    titles, not_run = [cell.title for cell in failed], total - len(results) - len(failed)
     if config.headroom:
-        print(write_headroom(folder, findings, made))
+        print(write_headroom(folder, findings, made, titles, not_run))
         print(f"written to {folder / HEADROOM}")
         return
     write_tables(folder, results)
-    not_run = total - len(results) - len(failed)
-    write_report(folder, findings, text, made, [cell.title for cell in failed], not_run)
+    write_report(folder, findings, text, made, titles, not_run)
     print(f"written to {folder}: {REPORT}, {PAGE}, episodes.parquet, curves.parquet")
 
 

@@ -262,8 +262,8 @@ class Task:
         env.close()
         return space, spec
 
-    def check(self) -> gym.Space:
-        """Makes the environment, with its forecaster, and returns its action space.
+    def check(self) -> tuple[gym.Space, gym.Space]:
+        """Makes the environment, with its forecaster, and returns its observation space and its action space.
 
         Raises:
             UserError: see `scene_spec`; unknown learners, or a driver that cannot drive the other agents.
@@ -274,9 +274,9 @@ class Task:
         env.close()
         check_unwrapped(env.observation_space, f"env '{self.env_id}'")
         _ = self.scene_spec
-        return env.action_space
+        return env.observation_space, env.action_space
 
-    def _check_multiagent(self) -> gym.Space:
+    def _check_multiagent(self) -> tuple[gym.Space, gym.Space]:
         env = self.make()
         for agent in env.possible_agents:
             check_unwrapped(env.observation_space(agent), f"'{agent}' of {self.env_id}")
@@ -286,9 +286,9 @@ class Task:
         has_others = len(learners) < len(env.possible_agents)
         if has_others:
             make_driver(self.driver, env, np.random.default_rng(0))
-        space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None).action_space
+        rows = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None)
         env.close()
-        return space
+        return rows.observation_space, rows.action_space
 
 
 _OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",

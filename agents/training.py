@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.algorithms import check_actions, check_finite, check_learns, log_interval, new_model
+from agents.algorithms import check_actions, check_finite, check_learns, check_observations, log_interval, new_model
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig
 from agents.forecast_errors import ForecastErrors
@@ -99,13 +100,14 @@ class TrainingPlan:
         spec = self.task.scene_spec
         return AttentionConfig() if spec is None else AttentionConfig.for_scenes(spec)
 
-    def check_action_space(self, space: spaces.Space) -> None:
-        """Checks that the algorithm supports an action space.
+    def check_spaces(self, observations: spaces.Space, actions: spaces.Space) -> None:
+        """Checks that a policy can read an observation space, and that the algorithm supports an action space.
 
         Raises:
-            UserError: it does not.
+            UserError: one of them does not fit.
         """
-        check_actions(self.algorithm, space, self.task.env_id)
+        check_observations(observations, self.task.env_id)
+        check_actions(self.algorithm, actions, self.task.env_id)
 
 
 def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
@@ -149,7 +151,7 @@ def _learn(
     plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote, progress_bar: bool
 ) -> None:
     """Trains for the remaining steps."""
-    every = plan.steps / plan.selections
+    every = Fraction(plan.steps, plan.selections)  # of floats, a multiple may be missed
     checkpoint = run_dir / CHECKPOINT_FILE
     kept = read_note(checkpoint)
     errors, progress = ForecastErrors(kept.get("loop_errors")), StepProgress(plan.steps, plan.num_envs)
@@ -293,7 +295,7 @@ class SelectBest(BaseCallback):
         arena: Arena,
         path: Path,
         num_episodes: int,
-        every_steps: float,
+        every_steps: float | Fraction,
         note: PolicyNote | None = None,
         *,
         curve: Path | None = None,

@@ -155,7 +155,7 @@ def tune(config: TuneConfig) -> Path:
         raise UserError("agents.tune needs the optuna package; pip install 'dgvae-rl[tune]'") from error
     plan, folder = config.plan({}, 0), config.folder
     check_out(folder)
-    plan.check_action_space(plan.task.check())
+    plan.check_spaces(*plan.task.check())
     _check_folder(folder, config)
     with locked(folder, "tuning"), disk_errors_of(folder / STUDY_FILE):
         _note(folder, config)

@@ -36,9 +36,12 @@ from envs.sb3.workers import WorkerVecEnv
 from envs.scene_stream import NOISE_SEED_INFO
 from envs.seeding import driver_rng
 from envs.supervision import Place, SupervisedEnv, check_numbers, named
-from envs.wrappers import SceneObservation
+from envs.wrappers import SceneObservation, scene_source
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
+MOST_STEPS = 100_000
+"""Number of steps after which an episode that is measured counts as endless."""
 EPISODE_INFO = "seeded_episode"
 """Key of the last info of an episode under which `SeededEpisodes` puts its result."""
 
@@ -233,6 +236,23 @@ class _MakeEnv:
         return SeededEpisodes(env, self.task.crash_key, self.task.success_key) if self.seeded else env
 
 
+def check_ends(steps: int, source: str) -> None:
+    """Checks that an episode that goes on has not gone on forever: some drivers never move.
+
+    Args:
+        steps: number of its steps.
+        source: name of the environment, for messages.
+
+    Raises:
+        UserError: it has `MOST_STEPS`.
+    """
+    if steps >= MOST_STEPS:
+        raise UserError(
+            f"{source}: an episode has not ended after {steps:,} steps; give the environment a limit, in gymnasium "
+            "max_episode_steps when it is registered, or the wrapper TimeLimit"
+        )
+
+
 class SeededEpisodes(gym.Wrapper):
     """Plays queued seeds one after another and puts an `EpisodeResult` into the last info of each episode.
 
@@ -288,12 +308,14 @@ class SeededEpisodes(gym.Wrapper):
         if isinstance(speed_mps, int | float | np.integer | np.floating):  # others may call a vector so
             self._speeds_mps.append(float(speed_mps))
         if self._action_names:
-            self._actions[self._action_names[int(action)]] += 1
+            self._actions[self._action_names.get(int(action), f"action-{int(action)}")] += 1
         crashed = self._keys.crashed(info)
         if crashed is not None:
             self._crashed = bool(self._crashed) or crashed
         if self._recorder is not None:
             self._recorder.note()
+        if not (terminated or truncated) and self._seed is not None:
+            check_ends(len(self._rewards), f"env '{scene_source(self.env)}'")
         if (terminated or truncated) and self._seed is not None:
             info[EPISODE_INFO] = self._result(self._seed, info)
         return obs, reward, terminated, truncated, info

@@ -37,6 +37,7 @@ from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
+from predictor.support.files import delete_leftovers
 from predictor.support.provenance import provenance
 
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
@@ -166,6 +167,7 @@ def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
         commit: commit that was checked out when the study began, whose code runs.
     """
     torch.set_num_threads(1)
+    delete_leftovers(folder)
     made = provenance(PACKAGES, _command()) | {"commit": commit}
     policy: BaseAlgorithm | None = None
     trained_s, curve = 0.0, list[dict[str, Any]]()
@@ -225,7 +227,7 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
     task = task_for(scenario, arm, where)
     cells = []
     try:
-        space, pin = task.check(), task.note.forecaster
+        found, pin = task.check(), task.note.forecaster
         for algorithm in study.algorithms:
             for seed in study.training_seeds:
                 plan = TrainingPlan(
@@ -243,7 +245,7 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
                     repeatable=True,
                     settings=study.settings.get(algorithm, {}),
                 )
-                plan.check_action_space(space)
+                plan.check_spaces(*found)
                 shown = None if pin is None else asdict(pin)
                 cells.append(Cell(scenario.name, arm.name, task, plan, study.episodes, shown))
     except UserError as error:

@@ -37,7 +37,7 @@ RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
 _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
-_OF_FORECASTS = ("perception_m", "what_if", "sizes_of")
+_OF_FORECASTS = ("perception_m", "what_if", "sizes_of", "num_samples", "horizon_steps")
 """Options of a scenario that an arm without forecasts does not take."""
 _NOT_CONSTANT = ("random", "varied", "keep-lane", "heuristic", "mixed")
 """Drivers that take no constant action, beside the planner, trained ones and one's own."""
@@ -322,8 +322,9 @@ def _scenario(name: str, table: Any, study: Study, where: str) -> Scenario:
             own[key] = converted(table.pop(key), hints[key], f"{where}: {key}")
     if own["references"] is None:
         own["references"] = MULTIAGENT_REFERENCES if is_multiagent_id(str(own["env_id"])) else REFERENCES
+    options = _task_options(table, where, tuple(own))
     try:
-        return Scenario(name=name, options=_task_options(table, where, tuple(own)), **own)  # type: ignore[arg-type]
+        return Scenario(name=name, options=options, **own)  # type: ignore[arg-type]
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
 

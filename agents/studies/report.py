@@ -1,7 +1,7 @@
 """Report of a study: tables, pictures and provenance, as Markdown and as one HTML page."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,17 +40,14 @@ def write_report(
     write_text(folder / PAGE, as_html(title_of(findings), blocks))
 
 
-def write_headroom(folder: Path, findings: Findings, provenance: dict[str, Any]) -> str:
-    """Writes the headroom table with what it took, and returns it as Markdown."""
-    blocks = [
-        Heading(f"Headroom: {title_of(findings)}", 1),
-        *_headroom(findings),
-        *_times(findings),
-        *_provenance(findings, provenance, ""),
-    ]
-    written = as_markdown(blocks)
-    write_text(folder / HEADROOM, written)
-    return as_markdown([*_headroom(findings), *_times(findings)])
+def write_headroom(
+    folder: Path, findings: Findings, provenance: dict[str, Any], failed: Sequence[str] = (), not_run: int = 0
+) -> str:
+    """Writes the headroom table with what it took, and returns it as Markdown; arguments as of `write_report`."""
+    found = [*_standing(findings, failed, not_run), *_headroom(findings), *_times(findings)]
+    title = Heading(f"Headroom: {title_of(findings)}", 1)
+    write_text(folder / HEADROOM, as_markdown([title, *found, *_provenance(findings, provenance, "")]))
+    return as_markdown(found)
 
 
 def title_of(findings: Findings) -> str:
@@ -63,11 +60,7 @@ def blocks_of(
 ) -> list[Block]:
     """Returns the blocks of the report; what differs between two runs of one study stands at its end."""
     study = findings.study
-    blocks: list[Block] = [Heading(title_of(findings), 1), Paragraph(_summary(findings))]
-    if failed:
-        blocks.append(Paragraph(f"Without a result: {'; '.join(failed)}. The numbers below are of the others."))
-    if not_run:
-        blocks.append(Paragraph(f"Not run yet: {not_run} cells of the study. The numbers below are of the others."))
+    blocks: list[Block] = [Heading(title_of(findings), 1), *_standing(findings, failed, not_run)]
     for scenario in findings.scenarios:
         blocks += _scenario(findings, scenario)
     if study.compared_with and findings.lines(trained=True):
@@ -90,18 +83,45 @@ def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str 
     return value.replace("-", "−")
 
 
+def _standing(findings: Findings, failed: Sequence[str], not_run: int) -> list[Block]:
+    """Returns what the numbers are made of, and which cells they lack."""
+    blocks: list[Block] = [Paragraph(_summary(findings))]
+    if failed:
+        blocks.append(Paragraph(f"Without a result: {'; '.join(failed)}. The numbers below are of the others."))
+    if not_run:
+        blocks.append(Paragraph(f"Not run yet: {not_run} cells of the study. The numbers below are of the others."))
+    return blocks
+
+
+def _span(counts: Iterable[int]) -> str:
+    """Returns the lowest and the highest of some numbers as text; one, if they are equal."""
+    found = sorted(set(counts)) or [0]
+    return " to ".join(map(str, dict.fromkeys((found[0], found[-1]))))
+
+
 def _summary(findings: Findings) -> str:
-    counts = sorted({len(runs) for (_, line), runs in findings.results.items() if line.algorithm is not None})
-    shown = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
+    seeds = {len(runs) for (_, line), runs in findings.results.items() if line.algorithm is not None}
+    episodes = _span(len(each.episodes) for runs in findings.results.values() for each in runs)
     return (
-        f"{shown} training {'seed' if counts == [1] else 'seeds'} per arm; {findings.study.episodes} test episodes per "
+        f"{_span(seeds)} training {'seed' if seeds == {1} else 'seeds'} per arm; {episodes} test episodes per "
         "policy and driver, on seeds that are the same for all and that neither training nor selection uses. A run is "
         "one training; its score is its mean return over these episodes. Intervals are 95 %: Student's for means over "
         "runs, Welch's for differences of two of them, percentiles of a bootstrap over runs for everything else; the "
         "latter are too narrow for few runs (that of a mean of five holds the truth in 83 % of cases). Drivers are not "
         "trained: their intervals are over episodes (of crash rates Wilson's) and cannot be compared with those over "
-        "runs."
+        "runs." + _unequal(findings)
     )
+
+
+def _unequal(findings: Findings) -> str:
+    """Returns a sentence on trainings of one scenario and algorithm that differ in length, as when `steps` changed."""
+    ends: dict[tuple[str, str | None], set[int]] = {}
+    for (scenario, line), runs in findings.results.items():
+        own = {each.curve[-1]["steps"] for each in runs if each.curve}
+        ends[scenario, line.algorithm] = ends.get((scenario, line.algorithm), set()) | own
+    unequal = {key: _span(steps) for key, steps in ends.items() if len(steps) > 1}
+    named = "; ".join(f"{scenario} ({algorithm}) {steps}" for (scenario, algorithm), steps in unequal.items())
+    return f" Trainings of different lengths [environment steps]: {named}." if named else ""
 
 
 def _scenario(findings: Findings, scenario: str) -> list[Block]:
@@ -210,7 +230,8 @@ def _all_scenarios(findings: Findings) -> list[Block]:
 
 
 def _pictures(findings: Findings) -> list[Block]:
-    episodes = findings.study.selection_episodes
+    points = [point for runs in findings.results.values() for each in runs for point in each.curve]
+    episodes = _span(point.get("episodes", findings.study.selection_episodes) for point in points)
     curves = (
         f"Mean return on the {episodes} selection seeds during training; bands: 95 % interval over runs. "
         "Diamonds: the policies that are kept, on the test seeds, with 95 % intervals; grey lines: drivers there. "

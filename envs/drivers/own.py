@@ -8,11 +8,13 @@ module is imported, so such a name is code.
 
 import copy
 from collections.abc import Iterator
+from contextlib import contextmanager
 from types import CellType, FunctionType
 from typing import Any
 
 import numpy as np
 
+from envs.supervision import reason_of
 from predictor.own_forecasters import PREFIX
 from predictor.support.errors import UserError
 from predictor.support.importing import load_named
@@ -41,16 +43,26 @@ class OwnDriver:
         """Returns the action of an observation, or the actions of all agents.
 
         Raises:
-            UserError: the user's function returned something that is no driver.
+            UserError: the user's function raised, or returned something that is no driver.
         """
         if self._act is None:
-            self._act = self._make(self._env, self._rng)
+            with self._named():
+                self._act = self._make(self._env, self._rng)
             if not callable(self._act):
                 raise UserError(
                     f"driver '{self._name}' must give a function from observations to actions, got "
                     f"{type(self._act).__name__}"
                 )
-        return self._act(observation)
+        with self._named():
+            return self._act(observation)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Says whose code it was that raised."""
+        try:
+            yield
+        except Exception as error:
+            raise UserError(f"driver '{self._name}' failed: {reason_of(error)}") from error
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OwnDriver":
         """Returns a driver with a state of its own, for a copy of the running environment."""

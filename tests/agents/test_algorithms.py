@@ -1,5 +1,6 @@
 """Every algorithm: trains behind the features extractor, is saved, goes on, is measured; what does not fit is said."""
 
+import re
 import sys
 import warnings
 from dataclasses import asdict, replace
@@ -12,7 +13,7 @@ import pytest
 import torch
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from agents.algorithms import CONTINUOUS, check_actions, log_interval
+from agents.algorithms import CONTINUOUS, check_actions, check_observations, log_interval
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import (
@@ -129,6 +130,7 @@ def test_action_spaces(algorithm: Algorithm):
         "discrete": gym.spaces.Discrete(3),
         "continuous": gym.spaces.Box(-1, 1, (2,), np.float32),
         "unbounded": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        "whole": gym.spaces.Box(0, 9, (2,), np.int64),
         "from one": gym.spaces.Discrete(3, start=1),
         "several": gym.spaces.MultiDiscrete([2, 3]),
         "several from one": gym.spaces.MultiDiscrete([2, 3], start=[0, 1]),
@@ -138,7 +140,7 @@ def test_action_spaces(algorithm: Algorithm):
     }
     several = ("several", "switches")
     refused = {"dqn": ("continuous", *several), "sac": ("discrete", *several)}
-    never = ("unbounded", "from one", "several from one", "square", "tuple")
+    never = ("unbounded", "whole", "from one", "several from one", "square", "tuple")
     refused |= {"qrdqn": refused["dqn"], "tqc": refused["sac"]}
     for name, space in spaces.items():
         if name not in (*refused.get(algorithm, ()), *never):
@@ -146,6 +148,26 @@ def test_action_spaces(algorithm: Algorithm):
             continue
         with pytest.raises(UserError, match=rf"^{algorithm} .*, some-v0 has .*; (use ppo|give|wrap|flatten)"):
             check_actions(algorithm, space, "some-v0")
+
+
+def test_observation_spaces():
+    box = gym.spaces.Box(-1, 1, (2,), np.float32)
+    read = [
+        box, gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), gym.spaces.Box(0, 9, (2,), np.int64), gym.spaces.Discrete(3),
+        gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary((2, 2)),
+        gym.spaces.Dict({"near": box, "lane": gym.spaces.Discrete(4)}),
+    ]  # fmt: skip
+    for space in read:
+        check_observations(space, "some-v0")
+    refused = [
+        gym.spaces.Tuple([box]), gym.spaces.Text(3), gym.spaces.Discrete(3, start=1), gym.spaces.Box(-1, 1, ()),
+        gym.spaces.Box(-1, 1, (0,)), gym.spaces.MultiDiscrete([[2, 3], [2, 2]]),
+        gym.spaces.MultiDiscrete([2, 3], start=[0, 1]),
+    ]  # fmt: skip
+    for space in (*refused, *(gym.spaces.Dict({"near": box, "odd": space}) for space in refused)):
+        odd = space["odd"] if isinstance(space, gym.spaces.Dict) else space
+        with pytest.raises(UserError, match=f"some-v0 has {re.escape(str(odd)[:20])}.*; flatten it, in gymnasium with"):
+            check_observations(space, "some-v0")
 
 
 @pytest.mark.parametrize("algorithm", CONTRIB)

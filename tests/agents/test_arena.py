@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import vec_envs
-from agents.arena import Arena, EgoArena, MultiagentArena, open_arena, run_episodes
+from agents.arena import Arena, EgoArena, MultiagentArena, _acting, open_arena, run_episodes
 from agents.task import Observe, Task
 from agents.vec_envs import SeededEpisodes, make_venv
 from envs.drivers.trained import EgoDriver
@@ -154,6 +154,20 @@ def test_a_policy_of_other_observations_or_actions_is_refused_in_one_line(
         arena.play(policy, [0])
     assert "\n" not in str(error.value)
     arena.close()
+
+
+def test_the_number_of_values_of_each_action_must_be_that_of_the_training():
+    venvs = []
+    for counts in ([3, 4], [2, 2], [3, 4]):
+        env: Any = gym.Env()
+        env.observation_space, env.action_space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete(counts)
+        venvs.append(DummyVecEnv([lambda env=env: env]))
+    policy = PPO("MlpPolicy", venvs[0], n_steps=4, batch_size=4)
+    assert _acting(policy, venvs[2])
+    with pytest.raises(
+        UserError, match=r"trained with the action MultiDiscrete\(\[3 4\]\), got MultiDiscrete\(\[2 2\]"
+    ):
+        _acting(policy, venvs[1])
 
 
 class _Film(gym.Env):

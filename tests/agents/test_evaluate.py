@@ -79,6 +79,21 @@ def test_only_what_has_to_be_trusted_may_be_named_beside_the_policy_s_forecaster
         evaluate._trained(config, tmp_path)
 
 
+def test_a_policy_knows_the_checkpoint_that_ships_for_its_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def trained(task: Task, named: str) -> Task:
+        found = {"policy_zip": tmp_path / "policy.zip", "local_policy": tmp_path, "algorithm_of": "ppo"}
+        for name, value in (found | {"task_of_policy": task}).items():
+            monkeypatch.setattr(evaluate, name, lambda *given, value=value, **more: value)
+        return evaluate._trained(EvaluateConfig(run_dir=tmp_path, checkpoint=named), tmp_path).task
+
+    shipped, blind = Task("highway-fast-v0", "forecast"), Task("highway-fast-v0", "none")
+    assert trained(shipped, "highway") == shipped
+    with pytest.raises(UserError, match="was trained on forecaster highway, got --checkpoint merge; leave it out"):
+        trained(shipped, "merge")
+    with pytest.raises(UserError, match="sees no forecaster's forecasts, got --checkpoint highway; leave it out"):
+        trained(blind, "highway")
+
+
 def test_the_planner_takes_the_checkpoint_that_a_run_names():
     task = Task("highway-fast-v0", "forecast", checkpoint="highway")
     named = ("planner:highway", "planner@0.3:highway", "planner:merge", "slower")

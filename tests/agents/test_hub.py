@@ -10,11 +10,11 @@ import pytest
 
 from agents import evaluate
 from agents import hub as policies
-from agents.hub import policy_from_hub, push_policy_to_hub
+from agents.hub import card_of, policy_from_hub, push_policy_to_hub
 from agents.policy import load_policy
 from agents.push import main
 from agents.runs import save_model
-from agents.task import Task
+from agents.task import Observe, Task
 from agents.watch import WatchConfig, write_film
 from predictor.support.errors import UserError, run_entry_point
 from tests.agents.test_policy import FAST, FEW, saved
@@ -27,6 +27,14 @@ pytest.importorskip("huggingface_hub")
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     with hub_for_test(tmp_path / "cache", monkeypatch, policies._fetched) as served:
         yield served
+
+
+@pytest.mark.parametrize(
+    ("arm", "seen"), [("forecast", "forecasts"), ("zeros", "the arm `zeros` in the shape of forecasts")]
+)
+def test_a_card_says_what_a_policy_sees(arm: Observe, seen: str):
+    assert f". Sees {seen} of `highway` (5 steps).\n" in card_of(Task(FAST, arm, env_kwargs=FEW).note, "ppo", "me/fast")
+    assert ". Sees no forecasts.\n" in card_of(Task(FAST, "none", env_kwargs=FEW).note, "ppo", "me/fast")
 
 
 @pytest.mark.slow

@@ -89,16 +89,16 @@ def test_what_the_wrappers_get():
 
 
 def test_the_check_gives_the_action_space_of_the_learners():
-    assert Task(TAG, "constant-velocity", learners=("adversary",)).check() == gym.spaces.Discrete(5)
+    assert Task(TAG, "constant-velocity", learners=("adversary",)).check()[1] == gym.spaces.Discrete(5)
     speaker, listener = (Task("simple_speaker_listener_v4", "none", learners=(name,)) for name in ("speaker_0", "all"))
-    assert speaker.check() == gym.spaces.Discrete(3)
+    assert speaker.check()[1] == gym.spaces.Discrete(3)
     with pytest.raises(UserError, match="learners: 'all' is neither an agent nor a role"):
         listener.check()
 
 
 def test_the_check_finds_drivers_that_cannot_drive():
-    assert Task(TOY, "none").check() == gym.spaces.Discrete(2)  # all agents learn
-    assert Task(TOY, "none", learners=("ant",), driver="varied").check() == gym.spaces.Discrete(2)
+    assert Task(TOY, "none").check()[1] == gym.spaces.Discrete(2)  # all agents learn
+    assert Task(TOY, "none", learners=("ant",), driver="varied").check()[1] == gym.spaces.Discrete(2)
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         Task(TOY, "none", learners=("ant",)).check()
 

@@ -284,9 +284,9 @@ def test_numbers_below_one_are_refused(field: str):
 
 def test_dqn_needs_discrete_actions():
     space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    plan(algorithm="ppo").check_action_space(space)
+    plan(algorithm="ppo").check_spaces(space, space)
     with pytest.raises(UserError, match="dqn needs a discrete action space, highway-fast-v0 has Box"):
-        plan(algorithm="dqn", steps=201).check_action_space(space)
+        plan(algorithm="dqn", steps=201).check_spaces(space, space)
 
 
 def test_models_follow_their_preset():

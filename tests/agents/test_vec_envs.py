@@ -3,9 +3,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from agents.arena import run_episodes
+from agents import vec_envs
+from agents.arena import MultiagentArena, run_episodes
 from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, SeededEpisodes, make_venv
 from envs.registry import make_env
@@ -56,6 +58,33 @@ def test_what_is_no_speed_is_not_reported():
     while EPISODE_INFO not in info:
         *_, info = env.step(1)
     assert np.isnan(info[EPISODE_INFO].mean_speed_mps)
+
+
+def test_an_episode_without_end_is_said(monkeypatch: pytest.MonkeyPatch):
+    class Endless(Dice):
+        def reset(self, **named: Any) -> tuple[Any, dict[str, Any]]:
+            found = super().reset(**named)
+            self._left = 0
+            return found
+
+    monkeypatch.setattr(vec_envs, "MOST_STEPS", 9)
+    dice, endless = (DummyVecEnv([lambda made=made: SeededEpisodes(made(), "crashed")]) for made in (Dice, Endless))
+    assert len(run_episodes(dice, "random", range(9))) == 9
+    with pytest.raises(UserError, match="^env 'Endless': an episode has not ended after 9 steps; give the environment"):
+        run_episodes(endless, "random", range(9))
+    arena, tag = (
+        MultiagentArena(Task("simple_tag_v3", "none", learners=("adversary",))),
+        "simple_tag_v3: an episode has",
+    )
+    policy = PPO("MlpPolicy", arena._copies(1), n_steps=2, batch_size=2)
+    monkeypatch.setattr(vec_envs, "MOST_STEPS", 25)
+    for drives in ("idle", policy):
+        assert arena.play(drives, [0])[0].length == 25
+    monkeypatch.setattr(vec_envs, "MOST_STEPS", 24)
+    for drives in ("idle", policy):
+        with pytest.raises(UserError, match=f"^{tag} not ended after 24 steps; give the environment a limit, in gymn"):
+            arena.play(drives, [0])
+    arena.close()
 
 
 def dice_venv(num_envs: int) -> VecEnv:

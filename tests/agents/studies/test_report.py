@@ -204,6 +204,21 @@ def test_the_report_counts_the_runs_that_there_are(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_the_report_says_what_the_results_hold(tmp_path: Path):
+    """The study's file may have changed since."""
+    point = {"return": 5.0, "seconds": 6.0, "episodes": 7}
+    found = [
+        r if r.algorithm is None else replace(r, curve=({"steps": 100 + 20 * bool(r.seed)} | point,)) for r in results()
+    ]
+    found[0] = replace(found[0], episodes=found[0].episodes[:1])
+    text = written(tmp_path / "all", found)[0]
+    assert "; 1 to 2 test episodes per policy and driver" in text and "Mean return on the 7 selection seeds" in text
+    assert "Trainings of different lengths [environment steps]: one (ppo) 100 to 120." in text
+    text = written(tmp_path / "alike", results())[0]
+    assert "; 2 test episodes per policy and driver" in text and "different lengths" not in text
+
+
+@pytest.mark.slow
 def test_what_failed_is_named(tmp_path: Path):
     write_report(tmp_path, found_in(study(), results()[:-1]), "", MADE, ["one, oracle, ppo, seed 2"])
     text = (tmp_path / "report.md").read_text()
@@ -221,7 +236,10 @@ def test_headroom_alone(tmp_path: Path):
         "| scenario | best constant action | planner | planner:oracle | zeros | oracle | headroom | forecast uses |"
         in text
     )
-    assert "minutes of a training" in text
+    assert "minutes of a training" in text and "3 training seeds per arm" in text and "Without a result" not in text
+    text = write_headroom(tmp_path, found_in(study(), results()[:-1]), MADE, ["one, oracle, ppo, seed 2"], 4)
+    for said in ("Without a result: one, oracle, ppo, seed 2.", "Not run yet: 4 cells of the study."):
+        assert said in text and said in (tmp_path / "headroom.md").read_text()
     assert "## Provenance" in (tmp_path / "headroom.md").read_text()
 
 

@@ -185,7 +185,7 @@ def test_a_name_that_stands_for_nothing_is_one_sentence(env_id: str, make: Any, 
     ("name", "sentence"),
     [
         (NUMBER, f"driver '{NUMBER}' must give a function from observations to actions, got int"),
-        (RAISES, "highway-fast-v0, seed 0, step 1: KeyError: 'goal'"),
+        (RAISES, f"highway-fast-v0, seed 0, step 1: driver '{RAISES}' failed: KeyError: 'goal'"),
     ],
 )
 def test_a_function_that_fails_is_named(name: str, sentence: str):
