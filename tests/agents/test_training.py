@@ -109,7 +109,10 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
     assert read_note(tmp_path / "best.zip")["steps"] == 24
 
 
-@pytest.mark.parametrize(("steps", "selections", "expected"), [(10, 3, [4, 7, 10]), (9, 2, [5, 9]), (3, 5, [1, 2, 3])])
+@pytest.mark.parametrize(
+    ("steps", "selections", "expected"),
+    [(10, 3, [4, 7, 10]), (9, 2, [5, 9]), (3, 5, [1, 2, 3]), (10, 6, [2, 4, 5, 7, 9, 10])],
+)
 def test_a_policy_is_measured_as_often_as_it_is_said(
     steps: int, selections: int, expected: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -60,6 +60,16 @@ def test_what_is_no_speed_is_not_reported():
     assert np.isnan(info[EPISODE_INFO].mean_speed_mps)
 
 
+def test_actions_that_are_no_driver_s_are_counted_by_their_number():
+    env = SeededEpisodes(Dice(), "crashed")
+    env.queue([3])
+    env.reset()
+    info: dict[str, Any] = {}
+    while EPISODE_INFO not in info:
+        *_, info = env.step(9)
+    assert set(info[EPISODE_INFO].action_counts) == {"action-9"}
+
+
 def test_an_episode_without_end_is_said(monkeypatch: pytest.MonkeyPatch):
     class Endless(Dice):
         def reset(self, **named: Any) -> tuple[Any, dict[str, Any]]:

@@ -242,9 +242,11 @@ def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
     before = json.loads((cell / "result.json").read_text())
     (cell / "result.json").unlink()
     (cell / "run" / "curve.json").unlink()
+    (cell / ".result.json.0123456789abcdef.partial.json").write_text("{")  # what a kill left
     assert run_study(run) == 0
     after = json.loads((cell / "result.json").read_text())
     assert after["episodes"] == before["episodes"] and after["curve"] == [] and after["train_seconds"] == 0
+    assert not list(cell.glob(".*partial*"))
 
 
 @pytest.mark.slow
