@@ -290,6 +290,8 @@ def test_dqn_needs_discrete_actions():
     plan(algorithm="ppo").check_spaces(space, space)
     with pytest.raises(UserError, match="dqn needs a discrete action space, highway-fast-v0 has Box"):
         plan(algorithm="dqn", steps=201).check_spaces(space, space)
+    with pytest.raises(UserError, match="a policy reads arrays .* highway-fast-v0 has Tuple"):
+        plan(algorithm="ppo").check_spaces(gym.spaces.Tuple([space]), space)
 
 
 def test_models_follow_their_preset():

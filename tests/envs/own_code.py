@@ -67,6 +67,11 @@ def raises(env: Any, rng: np.random.Generator) -> Any:
     raise KeyError("goal")
 
 
+def raises_later(env: Any, rng: np.random.Generator) -> Any:
+    """A driver with a bug in its first step."""
+    return lambda observation: {}["goal"]
+
+
 class OneOnly(Pushed):
     """A simulator with an engine that a process has once: a second one raises at its reset, until the first closes."""
 

@@ -51,6 +51,13 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
     assert not set(before.values()) & {cell.name for cell in cells()}
 
 
+def test_sizes_of_forecasts_are_not_in_the_names_of_cells_without_any(tmp_path: Path):
+    def names(more: str) -> list[str]:
+        return [cell.name for cell in cells_of(read_study(study_path(tmp_path, study_text() + more)), "corridor.toml")]
+
+    assert names("num_samples = 6\nhorizon_steps = 3\n") == names("") != names("env_kwargs = {sleep_s = 0.001}\n")
+
+
 def test_the_code_of_a_driver_of_ones_own_is_in_the_name(
     cells: Callable[..., list[Cell]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

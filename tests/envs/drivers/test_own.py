@@ -186,6 +186,7 @@ def test_a_name_that_stands_for_nothing_is_one_sentence(env_id: str, make: Any, 
     [
         (NUMBER, f"driver '{NUMBER}' must give a function from observations to actions, got int"),
         (RAISES, f"highway-fast-v0, seed 0, step 1: driver '{RAISES}' failed: KeyError: 'goal'"),
+        (f"{RAISES}_later", f"highway-fast-v0, seed 0, step 1: driver '{RAISES}_later' failed: KeyError: 'goal'"),
     ],
 )
 def test_a_function_that_fails_is_named(name: str, sentence: str):

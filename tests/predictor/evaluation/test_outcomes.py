@@ -8,7 +8,13 @@ from torch import Tensor
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
 from predictor.evaluation.graph_accuracy import graph_accuracy
-from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows
+from predictor.evaluation.outcomes import (
+    Outcome,
+    run_sequence_batch,
+    run_window_batch,
+    run_windows,
+    windows_per_forward,
+)
 from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
@@ -239,3 +245,12 @@ def test_a_forecaster_with_an_ego_forecasts_every_agent_of_windows_without_one()
     assert plain.edge_types is not None and behind.edge_types[:, 1:, 1:].equal(plain.edge_types)
     assert (behind.edge_types[:, 0] == -1).all() and (behind.edge_types[:, :, 0] == -1).all()
     assert plain.edge_attributes is not None and behind.edge_attributes[:, 1:, 1:].equal(plain.edge_attributes)
+
+
+def test_windows_of_nobody_fit_into_one_forward():
+    seen = np.zeros((6, 2), dtype=np.bool_)
+    seen[5] = True  # after all forecasts
+    nobody = Episode(np.zeros((6, 2, 4), np.float32), seen, np.arange(2))
+    windows = Windows([nobody], spec(has_ego=False), 2, 2)
+    chosen = np.flatnonzero(windows.index[:, 1] < 5)
+    assert windows_per_forward(windows, chosen, 3) == 256
