@@ -314,10 +314,11 @@ class SeededEpisodes(gym.Wrapper):
             self._crashed = bool(self._crashed) or crashed
         if self._recorder is not None:
             self._recorder.note()
-        if not (terminated or truncated) and self._seed is not None:
-            check_ends(len(self._rewards), f"env '{scene_source(self.env)}'")
-        if (terminated or truncated) and self._seed is not None:
-            info[EPISODE_INFO] = self._result(self._seed, info)
+        if self._seed is not None:
+            if terminated or truncated:
+                info[EPISODE_INFO] = self._result(self._seed, info)
+            else:
+                check_ends(len(self._rewards), f"env '{scene_source(self.env)}'")
         return obs, reward, terminated, truncated, info
 
     def _result(self, seed: int, last_info: Mapping[str, Any]) -> EpisodeResult:

@@ -179,7 +179,7 @@ def _plot(
     samples, batch = min(config.num_samples, 10), windows.batch(busiest)
     (outcome,) = run_windows(model, windows, busiest, horizon, samples, config.seed, len(busiest), device)
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
-    for window, ax in zip(range(len(busiest)), axes.flat, strict=False):
+    for window, ax in enumerate(axes.flat[: len(busiest)]):
         past = slice(0, int(batch.last_observed[window]) + 1)
         plot_scene(
             ax,
