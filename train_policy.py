@@ -19,6 +19,7 @@ from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
 from agents.results import MOST_EPISODES, PACKAGES
 from agents.runs import CHECKPOINT_FILE, FORECASTER, POLICY_FILE, check_forecaster, load_model, open_run
+from agents.shaping import SHAPED
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
@@ -171,6 +172,8 @@ class TrainPolicyConfig:
                 )
         if not self.shaping:
             require_multiagent(self.env_id, "no-shaping", "changes the rewards of simple_tag alone")
+            if ":" not in self.env_id and not self.env_id.startswith(SHAPED):
+                raise UserError(f"no-shaping changes the rewards of {SHAPED} alone, got {self.env_id}; leave it out")
         for name in ("eval_episodes", "selection_episodes"):
             check_count(getattr(self.sizes, name), name)
         check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")

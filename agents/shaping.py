@@ -15,7 +15,7 @@ from envs.readers.mpe import mpe_scenario
 
 PER_METRE = 10.0
 """Reward for a metre closer to the prey: across the arena as much as for two touches."""
-SCENARIO = "simple_tag"
+SHAPED = "simple_tag"
 """Scenario of mpe2 whose rewards are shaped."""
 
 
@@ -64,4 +64,4 @@ class Chase(BaseParallelWrapper):
 
 def shaped(env: ParallelEnv) -> ParallelEnv:
     """Returns the environment with shaped rewards; itself, if it is not one whose rewards are rare."""
-    return Chase(env) if mpe_scenario(env) == SCENARIO else env
+    return Chase(env) if mpe_scenario(env) == SHAPED else env

@@ -594,6 +594,10 @@ def test_evaluating_no_run_is_one_clear_line(
             "no-shaping changes the rewards of simple_tag alone, merge-v1 has one ego; leave no-shaping out",
         ),
         (
+            {"env_id": "simple_spread_v3", "shaping": False},
+            "no-shaping changes the rewards of simple_tag alone, got simple_spread_v3; leave it out",
+        ),
+        (
             {"env_id": "simple_spread_v3", "driver": "mixed"},
             r"driver drives the agents that do not learn, and all of simple_spread_v3 do; name those that learn "
             r"\(learners\), or leave driver out",
