@@ -24,7 +24,7 @@ from predictor.scene import Scene, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
 
@@ -62,6 +62,7 @@ class ChurnConfig:
         least = 2 * self.measurements * self.num_envs
         if self.steps < least:
             raise UserError(f"steps must be at least {least} (2 · measurements · num_envs), got {self.steps}")
+        check_out_file(self.out)
 
 
 class Churning(gym.Env):

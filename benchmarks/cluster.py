@@ -25,7 +25,7 @@ from predictor.support.cluster import INSTALL, Cluster, connected
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.markdown import table
 from predictor.support.provenance import provenance
 
@@ -57,6 +57,7 @@ class ClusterConfig:
         """
         check_at_least(self, 1, "tasks", "rounds")
         check_at_least(self, NODES, "episodes")
+        check_out_file(self.out)
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ from envs.sb3.agents_as_rows import ParallelVecEnv
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -54,6 +54,7 @@ class CopiesConfig:
         """
         check_at_least(self, 1, "steps", "blocks")
         check_at_least(self, 2, "copies")
+        check_out_file(self.out)
 
 
 @dataclass(frozen=True)

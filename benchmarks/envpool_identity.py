@@ -24,6 +24,9 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
+EMPTY = 3
+"""Number of episodes without another vehicle after which a replay gives up."""
+
 
 @dataclass(frozen=True)
 class IdentityConfig:
@@ -156,6 +159,8 @@ def count_replay(env_id: str, config: IdentityConfig) -> Count:
             names = [*now, *(name for name in numbers if name not in now)]
             count.add(*(np.array([known.get(name, -1) for name in names]) for known in (numbers, now)))
         numbers, ended = now, not ended and (terminated or truncated)
+        if episode > EMPTY and not count.pairs:
+            raise UserError(f"{env_id} had no other vehicle in {EMPTY} episodes; leave it out of --replay")
     count.resets = episode - 1
     env.close()
     return count

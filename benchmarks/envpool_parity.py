@@ -29,7 +29,7 @@ from envs.wrappers import ForecastObservation
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 
 _SAME_M = 1e-6
@@ -75,6 +75,7 @@ class ParityConfig:
             raise UserError(f"cannot compare {', '.join(unknown)}: unknown, or without other vehicles")
         if _CONTINUOUS in self.task_ids:
             raise UserError(f"cannot compare {_CONTINUOUS}: its actions are continuous; compare Intersection-v0")
+        check_out_file(self.out)
 
 
 # --- The same state in both -------------------------------------------------------------------------------------------
@@ -288,6 +289,8 @@ def episodes_table(task_id: str, driver: str, both: Sequence[tuple[str, Episodes
 def main() -> None:
     """Runs the command."""
     config = parse(ParityConfig, __doc__)
+    if config.policy is not None:
+        sees_forecasts(str(config.policy))  # raises before minutes of work
     console = Console(width=140)
     results: dict[str, Any] = {}
     for task_id in config.task_ids:

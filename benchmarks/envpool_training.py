@@ -24,7 +24,7 @@ from agents.vec_envs import make_venv
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -59,6 +59,7 @@ class TrainingSpeedConfig:
         check_at_least(
             self, 1, "num_envpool_envs", "num_plain_envs", "blocks", "plain_steps", "envpool_steps", "threads"
         )
+        check_out_file(self.out)
 
 
 class Timed:

@@ -29,7 +29,7 @@ from predictor.forecaster import Forecaster
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import tune
 
@@ -66,11 +66,12 @@ class GraphConfig:
         if not self.checkpoint or not self.data:
             raise UserError("give at least one of --checkpoint and one of --data")
         check_at_least(self, 1, "burn_in_steps", "horizon_steps", "max_windows", "stride", "threads", "neighbours")
+        check_out_file(self.out)
 
 
 def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> dict[str, float]:
     """Measures errors [m] over the windows, and the seconds for all of them."""
-    chosen = protocol_indices(windows, config.stride, config.max_windows, seed=0)
+    chosen = protocol_indices(windows, config.stride, config.max_windows, 0, config.burn_in_steps)
     tally, began = Tally(), time.perf_counter()
     for outcome in run_windows(forecaster, windows, chosen, config.horizon_steps, batch_size=1):
         tally.add(outcome)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from envs.evaluate import EvaluateConfig
 from envs.registry import checkpoint_for
 from envs.rollouts.episode import MODEL, EpisodeTask, play
+from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.displacement import displacement
@@ -25,7 +26,7 @@ from predictor.evaluation.outcomes import Outcome
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.markdown import table
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
@@ -59,8 +60,9 @@ class JointConfig:
         for name in ("env_ids", "agents"):
             if not getattr(self, name):
                 raise UserError(f"{name} needs at least one value, got none")
-        if self.out is not None and self.out.is_dir():
-            raise UserError(f"out must be a file, {self.out} is a folder; name a file")
+        if len({*self.env_ids}) < len(self.env_ids):
+            raise UserError(f"env_ids must differ, got {', '.join(self.env_ids)}")
+        check_out_file(self.out)
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,14 @@ def measure(env_id: str, config: JointConfig) -> list[Errors]:
     horizon = load_forecaster(checkpoint, world.spec, f"env '{env_id}'").horizon_steps
     world.close()
     scenes: list[np.ndarray] = []
-    for episode in track(range(config.episodes), f"play {env_id}"):
-        seed = EvaluateConfig.seed + episode
-        task = EpisodeTask(env_id, checkpoint, driver, seed, config.num_samples, horizon, EvaluateConfig.max_steps)
-        scenes.extend(displacements_of(play(task).outcomes[MODEL]))
+    first, steps = EvaluateConfig.seed, EvaluateConfig.max_steps
+    tasks = [
+        EpisodeTask(env_id, checkpoint, driver, first + i, config.num_samples, horizon, steps)
+        for i in range(config.episodes)
+    ]
+    with EpisodePool(play, workers=1) as pool:  # highway-env's intersection changes drivers for a whole process
+        for episode in track(pool.results(tasks), f"play {env_id}", total=len(tasks)):
+            scenes.extend(displacements_of(episode.outcomes[MODEL]))
     rng = np.random.default_rng(0)
     return [found for agents in config.agents if (found := errors_of(scenes, agents, rng)) is not None]
 

@@ -17,7 +17,7 @@ from predictor.online import MAX_ROWS
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import processor, resolve_device
 
@@ -61,6 +61,7 @@ class RowsConfig:
         if not 0 < self.seconds < float("inf"):
             raise UserError(f"seconds must be positive, got {self.seconds}")
         object.__setattr__(self, "device", resolve_device(self.device))
+        check_out_file(self.out)
 
 
 def exponents(measured: Sequence[Measured]) -> dict[str, float]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError
+from predictor.support.files import check_out_file
 
 SECTIONS: dict[str, str] = {
     "machine": "benchmarks.machine",
@@ -72,8 +73,7 @@ class Settings:
         """Checks that the paths to write are no folders.
 
         Raises:
-            UserError: one of them is a folder.
+            UserError: one of them is a folder, or cannot be written.
         """
         for path in (self.out, self.write_baseline):
-            if path is not None and path.is_dir():
-                raise UserError(f"{path} is a folder; name a file")
+            check_out_file(path)

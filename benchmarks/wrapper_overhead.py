@@ -31,7 +31,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -69,6 +69,7 @@ class OverheadConfig:
         check_at_least(self, 1, "num_envs", "steps", "blocks", "threads")
         if self.paper_size and self.checkpoint is not None:
             raise UserError(f"checkpoint '{self.checkpoint}' and --paper-size exclude each other; leave one out")
+        check_out_file(self.out)
 
 
 def run_block(venv: VecEnv, steps: int, seed: int) -> float:

@@ -210,7 +210,7 @@ class Arm:
             spaces: space of each entry of one scene.
 
         Raises:
-            UserError: the arm shows scenes of other episodes, and has none.
+            UserError: the arm shows scenes of other episodes, and has none, or those of other sizes.
         """
         batch = len(entries["valid"])
         if self.shown.other_scene:
@@ -227,6 +227,11 @@ class Arm:
                 target, values = full, entries[key]
                 if key in EDGE_KEYS:
                     target, values = _halves(full), _halves(values)
+                elif self.shown.other_scene and values.shape[2:] != full.shape[2:]:
+                    raise UserError(
+                        f"arm '{self.name}': '{key}' of an agent has the shape {full.shape[2:]} here and "
+                        f"{values.shape[2:]} in the bank; record the bank with this environment and forecaster"
+                    )
                 _fill(target, values, only_first=several and not self.shown.modes)
             found[key] = full
         return found

@@ -32,9 +32,17 @@ def record_bank(env: Wrapper, source: str, episodes: int = EPISODES) -> EntryBan
         episodes: number of episodes; episode i is reset with FIRST_SEED + i.
 
     Raises:
-        UserError: no scene had another agent.
+        UserError: another arm, a flattened observation, or no scene with another agent.
     """
-    assert env.stream.config.arm.name == Arm().name
+    shown = (
+        env.observation_space(env.possible_agents[0]) if isinstance(env, ForecastParallelEnv) else env.observation_space
+    )
+    arm = env.stream.config.arm.name
+    if arm != Arm().name or not isinstance(shown, gym.spaces.Dict):
+        raise UserError(
+            f"a bank is recorded with the arm '{Arm().name}' and flatten=False, got the arm '{arm}' and a "
+            f"{type(shown).__name__} observation"
+        )
     found: list[dict[str, NDArray[Any]]] = []
     for episode in range(episodes):
         rng = driver_rng(FIRST_SEED + episode)

@@ -244,7 +244,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     """Evaluates all checkpoints in all environments; writes each one's files under `config.out`.
 
     Returns:
-        The results, and the reason for each (env, checkpoint) of a transfer matrix that does not fit.
+        The results, and the reason for each (env, checkpoint) of a transfer matrix that was not measured.
     """
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
@@ -365,7 +365,7 @@ def main() -> None:
         return
     results, misfits = evaluate(config, console)
     if not results:
-        raise UserError("no checkpoint fits any environment: " + "; ".join(misfits.values()))
+        raise UserError("nothing was measured: " + "; ".join(misfits.values()))
     console.print(report.overview(results))
     if len(config.checkpoint) > 1:
         console.print(report.transfer(results, misfits))

@@ -12,6 +12,7 @@ with one ego, use `envs.wrappers.ForecastObservation`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -206,12 +207,13 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Steps the env, takes in the scene and forecasts."""
+        if self.stream.config.arm.shown.true_futures:
+            self._last_actions = deepcopy(dict(actions))  # the environment may change them
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         if "step" in self._unchecked:
             for agent, reward in rewards.items():
                 check_reward(reward, f"'{agent}' of {self._source}")
             self._unchecked.remove("step")
-        self._last_actions = dict(actions)
         scene, shown = self._read(observations), self._own(observations)
         if self._forward is not None:
             self._forward.go_on(self._place, scene, shown)

@@ -28,6 +28,8 @@ from tests.predictor.helpers import circling_episode, spec
 
 ROOT = Path(__file__).resolve().parents[1]
 
+FOLDER = ". is a folder; name a file"
+
 REFUSED: dict[str, list[tuple[str, str]]] = {
     "predictor.train": [
         ("--data absent --out new", "no episode store at absent"),
@@ -242,10 +244,12 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "benchmarks.wrapper_overhead": [
         ("--num-envs 0", "num_envs must be at least 1, got 0"),
         ("--vec thread", "invalid choice 'thread' for argument '--vec'"),
+        ("--out .", FOLDER),
         ("--env-id racetrack-v1 --num-envs 1", "blocks are of random discrete actions, the environment has Box("),
     ],
     "benchmarks.copies": [
         ("--copies 1", "copies must be at least 2, got 1"),
+        ("--out .", FOLDER),
         ("--env-id highway-fast-v0", "unknown multiagent env 'highway-fast-v0'; known: "),
     ],
     "benchmarks.joint_futures": [
@@ -253,35 +257,44 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--agents --", "agents needs at least one value, got none"),
         ("--env-ids --", "env_ids needs at least one value, got none"),
         ("--env-ids absent-v0", "no checkpoint ships for env 'absent-v0'"),
-        ("--out .", "out must be a file, . is a folder; name a file"),
+        ("--env-ids merge-v1 merge-v1", "env_ids must differ, got merge-v1, merge-v1"),
+        ("--out .", FOLDER),
     ],
     "benchmarks.rows": [
         ("--num-envs 0", "num_envs needs numbers of at least 1, got (0,)"),
         ("--max-rows 0", "max_rows must be at least 1, got 0"),
         ("--seconds 0", "seconds must be positive, got 0.0"),
+        ("--out .", FOLDER),
         ("--checkpoint absent", "no checkpoint 'absent'"),
         ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
-    "benchmarks.cluster": [("--episodes 1", "episodes must be at least 2, got 1")],
+    "benchmarks.cluster": [("--episodes 1", "episodes must be at least 2, got 1"), ("--out .", FOLDER)],
     "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
     "benchmarks.graph_accuracy": [
         ("--checkpoint absent --data absent", "no episode store at absent"),
         ("--checkpoint absent --data absent --neighbours 0", "neighbours must be at least 1, got (0,)"),
+        ("--checkpoint highway --data store --out .", FOLDER),
     ],
     "benchmarks.gpu_springs": [
         ("--steps -1", "steps must not be negative, got -1"),
         ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "benchmarks.churn": [
+        ("--out .", FOLDER),
         ("--num-envs 0", "num_envs must be at least 1, got 0"),
         ("--checkpoint absent", "no checkpoint 'absent'"),
     ],
     "benchmarks.envpool_identity": [("--num-envs 0", "num_envs must be at least 1, got 0")],
     "benchmarks.envpool_parity": [
         ("--task-ids Nope-v0", "cannot compare Nope-v0: unknown"),
+        ("--out .", FOLDER),
+        ("--policy absent.zip", "no policy at absent.zip"),
         ("--task-ids HighwayFast-v0 Intersection-v1", "cannot compare Intersection-v1: its actions are continuous"),
     ],
-    "benchmarks.envpool_training": [("--num-envpool-envs 0", "num_envpool_envs must be at least 1, got 0")],
+    "benchmarks.envpool_training": [
+        ("--num-envpool-envs 0", "num_envpool_envs must be at least 1, got 0"),
+        ("--out .", FOLDER),
+    ],
 }
 """Words of a command line → how the one line begins after "error: ", for each command."""
 

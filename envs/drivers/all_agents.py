@@ -6,6 +6,7 @@ does. Heuristics use the simulator's state; recordings hold only what a scene re
 and bound methods, not closures: `copy.deepcopy` of a running world copies their state too.
 """
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -176,7 +177,7 @@ def _choose(
 ) -> Any:
     if not last or own.random() < habits.attention:
         last[:] = [uniform_action(space, own, WHO) if own.random() < habits.slip else intend()]
-    return last[0]
+    return copy.deepcopy(last[0])  # an environment may change the action it is given
 
 
 class _PursuitIntentions:

@@ -1,5 +1,6 @@
 """Actions chosen from an action space alone, for drivers of an ego and drivers of all agents."""
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -80,10 +81,9 @@ def _varied(
     last: list[Any],
     seen: Any,
 ) -> Any:
-    if last and rng.random() <= persistence:
-        return last[0]
-    if isinstance(space, gym.spaces.Discrete):
-        last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
-    else:
-        last[:] = [uniform_action(space, rng, who)]
-    return last[0]
+    if not last or rng.random() > persistence:
+        if isinstance(space, gym.spaces.Discrete):
+            last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
+        else:
+            last[:] = [uniform_action(space, rng, who)]
+    return copy.deepcopy(last[0])  # an environment may change the action it is given

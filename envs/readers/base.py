@@ -153,10 +153,11 @@ def check_bounds(perception_m: Any, max_agents: Any) -> None:
     Raises:
         UserError: a value is no positive number, or no whole one.
     """
-    is_number = isinstance(perception_m, int | float | np.integer | np.floating)
+    is_number = isinstance(perception_m, int | float | np.integer | np.floating) and not isinstance(perception_m, bool)
     if perception_m is not None and not (is_number and perception_m > 0):
         raise UserError(f"perception_m must be a positive number, got {perception_m!r}")
-    if max_agents is not None and not (isinstance(max_agents, int | np.integer) and 1 <= max_agents <= MOST_AGENTS):
+    is_whole = isinstance(max_agents, int | np.integer) and not isinstance(max_agents, bool)
+    if max_agents is not None and not (is_whole and 1 <= max_agents <= MOST_AGENTS):
         raise UserError(f"max_agents must be a whole number from 1 to {MOST_AGENTS:,}, got {max_agents!r}")
 
 

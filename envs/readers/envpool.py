@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from envs.readers.base import Reader, perceive_batch, policy_step_s
+from envs.readers.base import Reader, check_bounds, perceive_batch, policy_step_s
 from envs.readers.identity import best_pairs
 from envs.simulators.envpool import HIGHWAY_ENV_OF
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
@@ -63,6 +63,7 @@ def envpool_spec(
     if task_id not in HIGHWAY_ENV_OF:
         raise UserError(f"no scene reader knows EnvPool's task '{task_id}'; known: {', '.join(HIGHWAY_ENV_OF)}")
     frame = _UNBOUNDED_X if task_id in _STRAIGHT_ROADS else _FIXED_MAP
+    check_bounds(perception_m, max_agents)
     spec = SceneSpec(dt_s=policy_step_s(config), frame=frame)
     if perception_m is not None:
         spec = replace(spec, perception_m=float(perception_m))

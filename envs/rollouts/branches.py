@@ -44,6 +44,8 @@ class Branch:
     """What forecasters get at each step; fewer scenes where the environment cannot go on."""
     crashed: frozenset[int] = frozenset()
     """Ids of the agents that have crashed by the end; none where the simulator knows no crash."""
+    cut: bool = False
+    """Whether the ego's time limit ended the branch before its last step, so that nobody knows what follows."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +213,8 @@ def _play(
         note(step + 1, world.perceived(), world.full_scene())
         if ended and not goes_on:
             break
-    return Branch(states, valid, tuple(seen), _crashed(world, ids)), drawn
+    cut = len(seen) <= horizon_steps and isinstance(world, EgoWorld) and world.cut
+    return Branch(states, valid, tuple(seen), _crashed(world, ids), cut), drawn
 
 
 def _crashed(world: World, ids: Int[np.ndarray, " agents"]) -> frozenset[int]:

@@ -73,7 +73,11 @@ def measure_graph(run: CauseRun) -> EnvGraph:
     if not _has_trees():
         misfits = {**misfits, TREES: "they need scikit-learn: pip install 'dgvae-rl[scores]'"}
     if not next(iter(scores.values())).pairs:
-        raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")
+        raise UserError(
+            f"{run.env_id}: no causal label is known in {run.episodes} episodes: nobody had another agent within "
+            f"{settings.near_m:g} m at a measured step, or none was reached; add --episodes, or raise --max-steps "
+            f"({run.max_steps})"
+        )
     to_ego = scores_to_ego(episodes, settings.threshold_m)
     return EnvGraph(run.env_id, run.driver, run.episodes, settings, scores, misfits, run.env_kwargs, to_ego)
 

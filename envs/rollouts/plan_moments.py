@@ -18,7 +18,7 @@ from envs.rollouts.branches import Branch, BranchPoint
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.reactions import STRAIGHT
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
-from envs.rollouts.world import World
+from envs.rollouts.world import EgoWorld, World
 from envs.seeding import plan_rng
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import has_scale
@@ -61,6 +61,8 @@ class PlanMoment:
     """Step within the episode."""
     crashed: Bool[np.ndarray, " branches"]
     """Whether the ego had collided by the end of the horizon."""
+    whole: bool
+    """Whether every branch reached the end of the horizon or of the episode, or a collision; not a time limit."""
     agents: Int[np.ndarray, " branches"]
     """Number of agents whose forecasts are compared: perceived, there for the whole horizon; 0 after a collision."""
     without_m: dict[str, Float[np.ndarray, " branches"]]
@@ -74,7 +76,10 @@ class PlanMoment:
 
 
 def play_plans(task: PlanTask) -> list[PlanMoment]:
-    """Plays one episode and returns its moments."""
+    """Plays one episode, to its end or a collision of the ego, and returns its moments.
+
+    Those after which the time limit ends a branch without a collision are left out: what follows is not known.
+    """
     world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
     world.reset(task.seed)
     model = plan_model_for(world.env)
@@ -91,9 +96,11 @@ def play_plans(task: PlanTask) -> list[PlanMoment]:
         for forecaster in forecasters.values():
             forecaster.observe(world.perceived())
         if step >= FIRST_STEP and step % EVERY == first:
-            moments.append(moment(world, model, forecasters, task.seed, step, task.horizon_steps))
-        if world.step():
-            break
+            asked = moment(world, model, forecasters, task.seed, step, task.horizon_steps)
+            if asked.whole:
+                moments.append(asked)
+        if world.step() or (isinstance(world, EgoWorld) and world.crashed):
+            break  # a copy of a world that has crashed would count as another collision
     return moments
 
 
@@ -124,6 +131,7 @@ def moment(
     played = [point.plain, *(point.driven(_Script(actions)) for actions in _scripts(plans, model))]
     ego = int(point.ids[0])
     crashed = np.array([ego in branch.crashed for branch in played])
+    whole = all(hit or not branch.cut for hit, branch in zip(crashed, played, strict=True))
     future = [_future(scene, branch, point.ids) for branch in played]
     counted = [
         valid & moving_agents(scene, world.spec) & (not hit) for (_, valid), hit in zip(future, crashed, strict=True)
@@ -146,7 +154,7 @@ def moment(
         risk[name] = _risk(planned, scene, plans, world.spec.dt_s, 0.0)
         risk_of_planner[name] = _risk(planned, scene, plans, world.spec.dt_s, plans.margin_m)
     agents = np.array([ok.sum() for ok in counted])
-    return PlanMoment(seed, step, crashed, agents, without_m, with_m, risk, risk_of_planner)
+    return PlanMoment(seed, step, crashed, whole, agents, without_m, with_m, risk, risk_of_planner)
 
 
 class _Script:

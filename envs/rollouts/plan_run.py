@@ -12,7 +12,7 @@ from envs.registry import name_with
 from envs.rollouts.branches import copied
 from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.interventions import knows_bodies
-from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
+from envs.rollouts.plan_moments import EVERY, FIRST_STEP, PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_world
 from predictor.checkpoint import load_forecaster
@@ -147,7 +147,10 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
     if not episodes:
-        raise UserError(f"{run.env_id}: none of {run.episodes} episodes has a step to measure; add --episodes")
+        raise UserError(
+            f"{run.env_id}: none of {run.episodes} episodes has a step to measure, every {EVERY}th from a random one "
+            f"on, after {FIRST_STEP} others; add --episodes, or raise --max-steps ({run.max_steps})"
+        )
     moments = [moment for found in episodes for moment in found]
     crashed = np.mean([moment.crashed[1:] for moment in moments], axis=0)
     return EnvPlans(
@@ -155,7 +158,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         run.driver,
         spec.dt_s,
         horizon,
-        run.episodes,
+        len(episodes),
         names,
         len(moments),
         crashed.tolist(),

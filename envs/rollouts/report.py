@@ -161,7 +161,9 @@ def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
     cells = _matrix(results, misfits)
     lines = [[env_id, *line.values()] for env_id, line in cells.items()]
     title = "transfer: minADE₁ [m] (below constant velocity)"
-    return FittedTable(title, ["env", *next(iter(cells.values()))], lines, "–: does not fit, see accuracy.md")
+    return FittedTable(
+        title, ["env", *next(iter(cells.values()))], lines, "–: not measured, see accuracy.md for the reason"
+    )
 
 
 def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> dict[str, dict[str, str]]:

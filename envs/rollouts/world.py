@@ -105,6 +105,7 @@ class EgoWorld:
 
     Attributes:
         crashed: whether the environment has reported a crash of the ego in this episode; None if it reports none.
+        cut: whether a time limit has ended this episode.
     """
 
     def __init__(self, env: SceneObservation | ForecastObservation, driver: str, env_id: str | None = None) -> None:
@@ -117,6 +118,7 @@ class EgoWorld:
         self.observation: dict[str, Any] = {}
         self._keys = outcome_keys(env)
         self.crashed: bool | None = None
+        self.cut = False
 
     @property
     def spec(self) -> SceneSpec:
@@ -132,7 +134,7 @@ class EgoWorld:
         self._place.begin(seed)
         with named(self._id, self._place):
             self.observation, _ = self.env.reset(seed=seed)
-        self.crashed = None
+        self.crashed, self.cut = None, False
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
 
@@ -161,6 +163,7 @@ class EgoWorld:
         crashed = self._keys.crashed(info)
         if crashed is not None:
             self.crashed = bool(self.crashed) or crashed
+        self.cut = bool(truncated and not terminated)
         return bool(terminated or truncated)
 
     def generators(self) -> list[np.random.Generator]:

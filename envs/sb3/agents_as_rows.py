@@ -28,7 +28,7 @@ from envs.parallel import batch_forwards, living
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from envs.sb3.partners import Partner, chosen_partner
 from envs.seeding import driver_rng
-from predictor.support.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError, short
 
 
 class ParallelVecEnv(VecEnv):
@@ -102,12 +102,14 @@ class ParallelVecEnv(VecEnv):
         Until it is called, the sampled futures of all copies have equal noise.
 
         Raises:
-            UserError: another number of seeds than of copies.
+            UserError: a seed that is no whole number from 0 on, or another number of seeds than of copies.
         """
+        copies = len(self._copies)
         given = np.asarray(np.random.default_rng().integers(2**31) if seed is None else seed)
-        own = given if given.ndim else given + np.arange(len(self._copies))
-        if len(own) != len(self._copies):
-            raise UserError(f"seed needs a number, or one for each of {len(self._copies)} copies, got {len(own)}")
+        if given.dtype.kind not in "iu" or given.shape not in ((), (copies,)) or (given < 0).any():
+            wanted = f"a whole number from 0 on, or one for each of {copies} copies"
+            raise UserError(f"seed needs {wanted}, got {short(seed)}")
+        own = given if given.ndim else given + np.arange(copies)
         self._seeds = [int(own[copy]) for copy in self.copies_of_envs]
         return self._seeds
 

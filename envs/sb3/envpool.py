@@ -48,7 +48,7 @@ class EnvPoolVecEnv(VecEnv):
         settings: settings of the task, see `make_pool`.
 
     Raises:
-        UserError: no EnvPool, an unknown task or setting, or num_envs below 1.
+        UserError: no EnvPool, an unknown task or setting, num_envs below 1, or a seed below 0; numbers must be whole.
     """
 
     def __init__(
@@ -64,8 +64,10 @@ class EnvPoolVecEnv(VecEnv):
         **settings: Any,
     ) -> None:
         """Builds the pool."""
-        if num_envs < 1:
-            raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise UserError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
+        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
+            raise UserError(f"seed must be a whole number from 0 on, got {seed!r}")
         self.task_id, self._num_threads, self._settings = task_id, num_threads, settings
         first = int(np.random.default_rng().integers(MAX_SEED)) if seed is None else seed
         self._pool = make_pool(task_id, [first + i for i in range(num_envs)], num_threads, **settings)

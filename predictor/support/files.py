@@ -149,6 +149,19 @@ def check_out(out: Path, only_stores: bool = False) -> None:
         raise UserError(f"{out} is a file; choose another --out")
 
 
+def check_out_file(out: Path | None) -> None:
+    """Checks that the file of a command's result, if there is one, can be written; called before any work is done.
+
+    Raises:
+        UserError: it is a folder, or see `check_place`.
+    """
+    if out is None:
+        return
+    check_place(out)
+    if out.is_dir():
+        raise UserError(f"{out} is a folder; name a file")
+
+
 def check_place(out: Path) -> None:
     """Checks that a path can become a file or a folder, unless it is an address; called before any work is done.
 

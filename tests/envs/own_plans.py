@@ -55,3 +55,4 @@ for kind in (Planned, Mute, Uncopied):
     register_reader(kind, FunctionReader(read_crowd, SPEC), crash_key=crash_key)
     register_plan_model(kind, lambda env: UpAndDown())
     gym.register(f"{kind.__name__}-v0", kind)
+gym.register("Short-v0", Planned, max_episode_steps=9)

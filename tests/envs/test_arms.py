@@ -211,3 +211,22 @@ def test_an_unknown_arm_is_refused():
 def test_another_scene_needs_a_bank():
     with pytest.raises(UserError, match="record_bank"):
         ForecastObservation(make_env(FAST), "highway", arm=Arm("shuffled")).reset(seed=0)
+
+
+def test_a_bank_of_other_sizes_is_refused(bank: EntryBank):
+    with pytest.raises(
+        UserError, match=r"arm 'shuffled': 'forecast' of an agent has the shape .*; record the bank with"
+    ):
+        observed("shuffled", bank, horizon_steps=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"arm": Arm("zeros")}, "got the arm 'zeros' and a Dict observation"),
+        ({"flatten": True}, "and a Box observation"),
+    ],
+)
+def test_a_bank_is_recorded_from_whole_forecasts(options: dict[str, Any], words: str):
+    with pytest.raises(UserError, match=f"a bank is recorded with the arm 'forecast' and flatten=False, .*{words}"):
+        record_bank(ForecastObservation(make_env(FAST), "highway", **options), "highway")

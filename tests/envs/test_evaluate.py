@@ -477,7 +477,7 @@ def test_two_checkpoints_of_which_none_fits_are_one_line(
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert code == 2
     assert len(errors) == 1
-    assert errors[0].startswith("error: no checkpoint fits any environment: ")
+    assert errors[0].startswith("error: nothing was measured: ")
 
 
 def test_missing_neighbours_are_no_misfit_of_a_checkpoint(

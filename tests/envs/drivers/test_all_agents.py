@@ -1,5 +1,6 @@
 import itertools
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -229,6 +230,16 @@ def test_varied_agents_differ_in_persistence():
     assert min(kept) < 0.2
     assert max(kept) > 0.7
     assert max(kept) < 1.0
+
+
+def test_a_heuristic_repeats_what_it_chose_even_if_the_environment_changed_the_action():
+    space, choice = gym.spaces.Box(-1, 1, (2,)), np.array([0.5, -0.5], dtype=np.float32)
+    habits = replace(Habits.draw(rng()), attention=0.0, slip=0.0)
+    last: list[Any] = []
+    for _ in range(3):
+        action = drivers._choose(space, rng(), habits, lambda: choice.copy(), last, None)
+        np.testing.assert_array_equal(action, choice)
+        action *= 0.5
 
 
 def test_mixed_agents_are_of_all_kinds_and_stay_so(monkeypatch: pytest.MonkeyPatch):

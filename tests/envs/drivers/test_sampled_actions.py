@@ -2,7 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.drivers.sampled_actions import uniform_action
+from envs.drivers.sampled_actions import uniform_action, varied_actions
 
 
 @pytest.mark.parametrize(
@@ -22,3 +22,13 @@ def test_a_number_without_axes_is_drawn_too(dtype: type):
     space, rng = gym.spaces.Box(-1, 1, (), dtype), np.random.default_rng(0)
     drawn = [uniform_action(space, rng, "drivers") for _ in range(3)]
     assert all(space.contains(each) for each in drawn) and len({float(each) for each in drawn}) == 3
+
+
+def test_an_environment_may_change_the_actions_it_is_given():
+    """The choices are those of a driver whose actions nobody changes."""
+    space = gym.spaces.Box(-1, 1, (2,))
+    kind, changed = (varied_actions(space, np.random.default_rng(3), "drivers") for _ in range(2))
+    for _ in range(30):
+        action, other = kind(None), changed(None)
+        np.testing.assert_array_equal(action, other)
+        other *= 0.5

@@ -248,8 +248,15 @@ def test_other_families_are_named():
         (0.0, None, "perception_m must be a positive number, got 0.0"),
         (-5.0, None, "perception_m must be a positive number, got -5.0"),
         (None, 0, "max_agents must be a whole number from 1 to 65,536, got 0"),
+        (True, None, "perception_m must be a positive number, got True"),
+        (None, True, "max_agents must be a whole number from 1 to 65,536, got True"),
     ],
 )
 def test_impossible_perception_is_named(perception_m: float | None, max_agents: int | None, words: str):
     with pytest.raises(UserError, match=words):
         reader_for(short_env(30), perception_m, max_agents)
+
+
+def test_a_reader_that_is_made_without_help_checks_its_numbers_too():
+    with pytest.raises(UserError, match="max_agents must be a whole number from 1 to 65,536, got 2.7"):
+        HighwayReader(short_env(30), max_agents=2.7)  # type: ignore[arg-type]

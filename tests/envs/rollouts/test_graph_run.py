@@ -164,7 +164,9 @@ def test_an_environment_is_measured_whatever_the_number_of_workers(tmp_path: Pat
 
 def test_no_label_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(graph_run, "play_graph", lambda task: [])
-    with pytest.raises(UserError, match=f"{TAG}: no causal label is known in 3 episodes; add --episodes"):
+    with pytest.raises(
+        UserError, match=f"{TAG}: no causal label is known in 3 episodes: nobody had another agent within"
+    ):
         measure_graph(run(save_tag(tmp_path / "tag")))
 
 

@@ -17,6 +17,7 @@ from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget
 from tests.envs.interventions import assert_same_scenes, played, road_world
 
+OWN = "tests.envs.own_plans:"
 HORIZON = 4
 SLOW_AHEAD = ((60.0, 8.0), (300.0, 0.0))
 """A driver 60 m ahead of the ego on its lane (id 1), and one out of sight on another (id 2)."""
@@ -130,6 +131,24 @@ def test_moments_come_at_every_fifth_step_from_a_random_one_on():
     for one, other in zip(moments, again, strict=True):
         np.testing.assert_array_equal(one.crashed, other.crashed)
         np.testing.assert_array_equal(one.without_m[STRAIGHT], other.without_m[STRAIGHT])
+
+
+def own_moments(env_id: str, driver: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Steps of the moments of an episode of seed 8 with a horizon of four steps, each step one if it counts."""
+    monkeypatch.setattr(plan_moments, "EVERY", 1)
+    return [found.step for found in play_plans(PlanTask(OWN + env_id, driver, ("constant-velocity",), 8, 30, 4))]
+
+
+def test_plans_that_a_time_limit_cuts_are_no_moments(monkeypatch: pytest.MonkeyPatch):
+    assert own_moments("Short-v0", "idle", monkeypatch) == [3, 4, 5], "9 steps, of which 4 follow each"
+
+
+def test_there_are_no_moments_after_a_collision_that_ends_no_episode(monkeypatch: pytest.MonkeyPatch):
+    world = open_world(OWN + "Planned-v0", "random")
+    assert isinstance(world, EgoWorld)
+    world.reset(8)
+    hit = next(step for step in range(30) if world.step() or world.crashed)
+    assert own_moments("Planned-v0", "random", monkeypatch) == list(range(3, hit + 1)) and hit == 11
 
 
 def test_plans_without_later_actions_cannot_be_played():

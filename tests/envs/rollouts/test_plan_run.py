@@ -31,6 +31,7 @@ def found(
         seed,
         5,
         hit,
+        True,
         agents,
         {"model": 2.0 * agents},
         {"model": with_m * agents},
@@ -70,7 +71,7 @@ def test_a_plan_that_harms_lowers_the_reduction_below_zero():
 
 def test_nothing_to_compare_is_none_and_no_error():
     hit = PlanMoment(
-        0, 5, np.array([True, True]), np.array([0, 0]), {"model": np.zeros(2)}, {"model": np.zeros(2)},
+        0, 5, np.array([True, True]), True, np.array([0, 0]), {"model": np.zeros(2)}, {"model": np.zeros(2)},
         {"model": np.ones(1)}, {"model": np.ones(1)},
     )  # fmt: skip
     scores = scores_of([[hit]], "model")
@@ -96,7 +97,9 @@ def test_an_environment_is_measured_whatever_the_number_of_workers():
 
 
 def test_episodes_without_a_moment_are_an_error():
-    with pytest.raises(UserError, match="highway-fast-v0: none of 2 episodes has a step to measure; add --episodes"):
+    with pytest.raises(
+        UserError, match="highway-fast-v0: none of 2 episodes has a step to measure, every 5th .*raise --max-steps"
+    ):
         measure_plans(run(max_steps=2))
 
 

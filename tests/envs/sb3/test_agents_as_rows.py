@@ -226,9 +226,10 @@ def test_seeds_may_be_of_numpy(seed: Any):
     assert seeds == [3, 4] and all(type(one) is int for one in seeds)
 
 
-def test_each_copy_needs_a_seed():
-    with pytest.raises(UserError, match="seed needs a number, or one for each of 2 copies, got 1"):
-        ParallelVecEnv([Scripted, Scripted]).seed([3])
+@pytest.mark.parametrize("seed", [[3], [0.2, 0.9], 1.5, -1, [0, -1], "a", True, [None, 1]])
+def test_each_copy_needs_a_seed(seed: Any):
+    with pytest.raises(UserError, match="seed needs a whole number from 0 on, or one for each of 2 copies, got"):
+        ParallelVecEnv([Scripted, Scripted]).seed(seed)
 
 
 def test_an_env_that_never_empties_its_agents_still_ends():

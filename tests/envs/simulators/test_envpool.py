@@ -552,9 +552,20 @@ def test_every_env_needs_an_action():
         venv.step(ACTIONS[0, :2])
 
 
-def test_a_pool_needs_envs():
-    with pytest.raises(UserError, match="num_envs must be at least 1, got 0"):
-        EnvPoolVecEnv("Merge-v0", 0)
+@pytest.mark.parametrize(
+    ("num_envs", "options", "words"),
+    [
+        (0, {}, "num_envs must be a whole number from 1 on, got 0"),
+        (2.5, {}, "num_envs must be a whole number from 1 on, got 2.5"),
+        (1, {"seed": 1.5}, "seed must be a whole number from 0 on, got 1.5"),
+        (1, {"seed": -1}, "seed must be a whole number from 0 on, got -1"),
+        (1, {"max_agents": 2.7}, "max_agents must be a whole number from 1 to 65,536, got 2.7"),
+        (1, {"perception_m": "x"}, "perception_m must be a positive number, got 'x'"),
+    ],
+)
+def test_a_pool_refuses_numbers_that_are_none_for_it(num_envs: Any, options: dict[str, Any], words: str):
+    with pytest.raises(UserError, match=words):
+        EnvPoolVecEnv("Merge-v0", num_envs, **options)
 
 
 def test_a_pool_without_scenes_has_none():
