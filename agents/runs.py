@@ -145,6 +145,8 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
         points = converted(read_json(path), tuple[dict[str, Any], ...], str(path))
         for place, point in enumerate(points):
             check_point(point, f"{path}: {place}")
+            if place and point["steps"] <= points[place - 1]["steps"]:
+                raise UserError(f"{path}: {place}: steps must rise, got {point['steps']}")
     except UserError as error:
         raise UserError(f"{advice} ({error})") from error
     return list(points)

@@ -189,7 +189,9 @@ def _all_results(folder: Path, study: Study) -> list[Result]:
     Raises:
         UserError: one of them is damaged.
     """
-    found = [read_result(file) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
+    ids = {scenario.name: scenario.env_id for scenario in study.scenarios}  # a scenario's may have changed
+    every = [read_result(file) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
+    found = [each for each in every if each.env_id == ids.get(each.scenario)]
     latest = {
         (each.scenario, each.arm, each.algorithm, each.seed): each
         for each in sorted(found, key=lambda each: str(each.provenance.get("time")))

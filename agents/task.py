@@ -37,6 +37,7 @@ from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices, check_positive
 from predictor.support.errors import UserError, short
+from predictor.support.memory import check_count
 from predictor.support.remote import is_remote
 from predictor.support.runtime import resolve_device
 from predictor.support.typed_values import converted
@@ -125,6 +126,7 @@ class Task:
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
         check_at_most(self, MOST_FUTURES, "num_samples", "horizon_steps")
+        check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
         if self.perception_m != math.inf:  # of an environment whose agents are seen from anywhere
             check_positive(self, "perception_m")
         if self.perception_m is not None and self.observe == "none":
@@ -286,6 +288,12 @@ class Task:
         has_others = len(learners) < len(env.possible_agents)
         if has_others:
             make_driver(self.driver, env, np.random.default_rng(0))
+        elif self.learners and self.driver != type(self).driver:
+            env.close()
+            raise UserError(
+                f"driver drives the agents that do not learn, and all of {self.env_id} do; name fewer learners, or "
+                "leave driver out"
+            )
         rows = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None)
         env.close()
         return rows.observation_space, rows.action_space

@@ -52,6 +52,8 @@ YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None, "crash_key":
 their names."""
 PATHS = ("checkpoint", "sizes_of")
 """Fields of `Task` with paths of checkpoints, of which the cells' names have hash and sizes instead."""
+LONGEST = 200
+"""Largest size of the readable part of a cell's name [bytes]; a file system has 255 for the whole."""
 RUN_FOLDER = "run"
 
 
@@ -95,7 +97,8 @@ class Cell:
         parts = [self.scenario, self.line, *([] if self.plan is None else [self.plan.algorithm, str(self.plan.seed)])]
         written = json.dumps(self.content, sort_keys=True, default=str)
         digest = hashlib.sha256(written.encode()).hexdigest()[:10]
-        return "".join(sign if sign.isalnum() or sign in ".-_" else "-" for sign in f"{'.'.join(parts)}-{digest}")
+        read = "".join(sign if sign.isalnum() or sign in ".-_" else "-" for sign in ".".join(parts))
+        return f"{read.encode()[:LONGEST].decode(errors='ignore')}-{digest}"
 
     @property
     def content(self) -> dict[str, Any]:
@@ -178,7 +181,7 @@ def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
         open_run(run, _run_config(cell), made, resume=True, free=free)
         policy = load_model(train(cell.plan, run), cell.plan.algorithm, device=cell.plan.device)
         curve = read_curve(run / CURVE_FILE)
-        trained_s = curve[-1]["seconds"] if curve else 0.0  # somebody removed a damaged one
+        trained_s = curve[-1].get("seconds") or 0.0 if curve else 0.0  # somebody removed a damaged one
     began = time.perf_counter()
     num_envs = 1 if cell.plan is None else min(cell.plan.num_envs, cell.episodes)
     arena = open_arena(cell.task, num_envs, in_process=True)

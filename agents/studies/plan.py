@@ -11,6 +11,7 @@ from typing import Any, get_args, get_type_hints
 
 from agents.preset_settings import settings_from_table
 from agents.presets import Algorithm
+from agents.results import MOST_EPISODES
 from agents.task import NO_CHECKPOINT, SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, is_planner
@@ -132,6 +133,7 @@ class Study:
         """Checks ranges and names."""
         check_choices(self)
         check_at_least(self, 1, "steps", "num_envs", "episodes", "selections", "selection_episodes", "checkpoint_every")
+        check_at_most(self, MOST_EPISODES, "episodes", "selection_episodes")
         if isinstance(self.seeds, int):
             check_at_least(self, 1, "seeds")
             check_at_most(self, MOST_SEEDS, "seeds")

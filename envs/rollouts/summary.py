@@ -1,6 +1,7 @@
 """Summarises the episodes of one environment: the accuracy of the deployed forecasts, of controls and of ablations."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +57,8 @@ def summarise_episodes(
 
     def line(title: str, found: Sequence[Outcome], spread: Sequence[float], partial: bool = False) -> Accuracy:
         tally = Tally(spread, miss_m, partial)
-        for outcome in found:
-            tally.add(outcome)
+        for number, outcome in enumerate(found):
+            tally.add(replace(outcome, episode=np.full(len(outcome.future), number)))
         return tally.accuracy(title, batch_intervals=True)
 
     # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.

@@ -181,7 +181,11 @@ def selection_return(best: Path) -> float:
     """
     try:
         found: float = read_note(best).get("selection_return", -math.inf)
-    except zipfile.BadZipFile as error:
+        if best.exists():
+            with zipfile.ZipFile(best) as file:
+                if (part := file.testzip()) is not None:
+                    raise zipfile.BadZipFile(f"{part} differs from its checksum")
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise UserError(f"{best} is damaged; remove it to go on without it") from error
     return found
 

@@ -20,6 +20,8 @@ from predictor.support.errors import UserError
 
 OPTIONAL = ("coverage", "mixture_nll", "mixture_coverage")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
+MOST_OFF = 1e-3
+"""Largest difference from 1 of the sum of an agent's probabilities."""
 SCALAR_NAMES = {"rmse_m": "overall_rmse_m"} | {name: name for name in OPTIONAL}
 """Names of the numbers over all steps, by name of the quantity at each step."""
 
@@ -123,12 +125,13 @@ class Tally:
 
         Raises:
             ValueError: the number of samples, steps or axes differs from that of earlier batches.
-            UserError: a forecast that counts is not finite.
+            UserError: a forecast that counts is not finite, nor are its probabilities or its scale such.
         """
         _, samples, _, horizon, axes = outcome.forecast.shape
         counted = outcome.valid.any(dim=-1)[:, None, :, None, None]
         if not bool((outcome.forecast.isfinite() | ~counted).all()):
             raise UserError("the forecaster forecasts numbers that are not finite; its weights are damaged or diverged")
+        _check_modes(outcome, counted[..., 0, 0])
         shape = (samples, horizon, axes)
         if self._shape not in (None, shape):
             raise ValueError(
@@ -280,6 +283,17 @@ class Tally:
     def _missed(self, forecast: Tensor, future: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         distance, known = metrics.min_displacement(forecast, future, valid)
         return (distance > self._threshold_m).to(distance.dtype), known
+
+
+def _check_modes(outcome: Outcome, counted: Tensor) -> None:
+    """Checks probabilities and scales of the agents that count (batch, 1, agents): scores of others mean nothing."""
+    probs, scale = outcome.mode_probs, outcome.scale
+    if probs is not None:
+        right = (probs >= 0).all(1, keepdim=True) & ((probs.sum(1, keepdim=True) - 1).abs() < MOST_OFF)
+        if not bool((right | ~counted).all()):
+            raise UserError("the forecaster's mode_probs must be at least 0 and sum to 1 over the modes of an agent")
+    if scale is not None and not bool((((scale >= 0) & scale.isfinite()) | ~counted[..., None, None]).all()):
+        raise UserError("the forecaster's xy_scale must be finite and at least 0")
 
 
 def summarise(

@@ -147,6 +147,9 @@ def check_out(out: Path, only_stores: bool = False) -> None:
     check_place(out)
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; choose another --out")
+    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise UserError(f"{out} cannot be made: no permission to write in {place}; choose another --out")
 
 
 def check_out_file(out: Path | None) -> None:

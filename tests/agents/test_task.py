@@ -17,6 +17,7 @@ from agents.vec_envs import make_venv
 from envs import ForecastObservation, make_env
 from envs.arms import ARMS
 from envs.drivers.trained import env_for_driver
+from envs.registry import make_multiagent_env
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY
 from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
@@ -58,6 +59,11 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
             "env_kwargs are for the gymnasium backend",
         ),
         ("merge-v1", {"num_samples": 0}, "num_samples must be at least 1, got 0"),
+        (
+            "merge-v1",
+            {"num_samples": 10_000, "horizon_steps": 10_000},
+            "horizon_steps times num_samples=100,000,000 needs at least",
+        ),
         (TAG, {"device": "tpu9"}, "device must be cpu, cuda or auto, got 'tpu9'"),
     ],
 )
@@ -101,6 +107,9 @@ def test_the_check_finds_drivers_that_cannot_drive():
     assert Task(TOY, "none", learners=("ant",), driver="varied").check()[1] == gym.spaces.Discrete(2)
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         Task(TOY, "none", learners=("ant",)).check()
+    everybody = tuple(make_multiagent_env(TAG).possible_agents)
+    with pytest.raises(UserError, match="driver drives the agents that do not learn, and all of .* do; name fewer"):
+        Task(TAG, "none", learners=everybody, driver="random").check()
 
 
 def test_the_check_needs_a_reader_for_forecasts():

@@ -251,6 +251,18 @@ def test_a_damaged_best_model_does_not_become_the_policy(tmp_path: Path, monkeyp
     assert load_model(train(training, tmp_path), "ppo").num_timesteps == 16
 
 
+def test_a_best_model_with_a_wrong_byte_does_not_replace_the_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: PPOPreset(n_steps=8, batch_size=8, n_epochs=1))
+    training = plan(steps=16, selections=1, selection_episodes=1, selection_envs=1, in_process=True)
+    policy, best = train(training, tmp_path), tmp_path / "best_model.zip"
+    good, content = policy.read_bytes(), bytearray(best.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    best.write_bytes(content)
+    with pytest.raises(UserError, match="best_model.zip is damaged; remove it to go on without it"):
+        train(training, tmp_path)
+    assert policy.read_bytes() == good
+
+
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
 
@@ -525,6 +537,9 @@ def test_a_damaged_curve_is_named(tmp_path: Path):
     with pytest.raises(UserError, match="curve.json is damaged; remove it to go on without it"):
         read_curve(tmp_path / "curve.json")
     assert read_curve(tmp_path / "absent.json") == []
+    (tmp_path / "curve.json").write_text('[{"steps": 8, "return": 1.0}, {"steps": 8, "return": 2.0}]')
+    with pytest.raises(UserError, match="curve.json is damaged; .*1: steps must rise, got 8"):
+        read_curve(tmp_path / "curve.json")
 
 
 def test_tensorboard_shows_crashes_speed_and_actions():

@@ -125,6 +125,13 @@ def test_lines_and_intervals_closed_form():
     assert [line.name for line in found.lines] == ["constant velocity (deployed)", "constant velocity"]
 
 
+def test_standard_errors_are_over_episodes():
+    """Two episodes of ten equal steps, errors of 1 and 3 m: a standard deviation of √2, a standard error of 1 m."""
+    episodes = [steps_of([error] * 10, [HORIZON] * 10, False) for error in (1.0, 3.0)]
+    found = summarise_episodes("here", STILL, "idle", HIGHWAY_SPEC, episodes).model.statistics["ade_m"]
+    assert found.subsets == 2 and found.standard_error == pytest.approx(1.0)
+
+
 def steps_of(errors_m: list[float], known: list[int], crashed: bool) -> Episode:
     """An episode of one agent: the error at each step, and how many of the future steps were reached."""
     forecast = torch.zeros(len(errors_m), 1, 1, HORIZON, 2)

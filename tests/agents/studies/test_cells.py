@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,12 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
         assert {title for title in before if after[title] != before[title]} == other, changes
     monkeypatch.setattr("agents.studies.cells._version", lambda name: "0.0")
     assert not set(before.values()) & {cell.name for cell in cells()}
+
+
+def test_a_long_name_of_a_driver_still_makes_a_folder(cells: Callable[..., list[Cell]]):
+    path = "/".join(["ä" * 100] * 3)
+    found = [replace(cells()[0], line=f"planner:{path}/{end}").name for end in ("one", "two")]
+    assert len(set(found)) == 2 and max(len(name.encode()) for name in found) <= 255
 
 
 def test_sizes_of_forecasts_are_not_in_the_names_of_cells_without_any(tmp_path: Path):

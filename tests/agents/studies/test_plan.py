@@ -100,6 +100,8 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
         (study_text(step="3"), "corridor.toml: unknown key 'step'; there are title, algorithms, seeds, steps"),
         (study_text(steps="0"), "corridor.toml: steps must be at least 1, got 0"),
         (study_text(steps='"many"'), "corridor.toml: steps must be a whole number, got 'many'"),
+        (study_text(episodes="20000"), "corridor.toml: episodes must be at most 10,000, got 20000"),
+        (study_text(selection_episodes="20000"), "corridor.toml: selection_episodes must be at most 10,000, got 20000"),
         (study_text(steps="true"), "corridor.toml: steps must be a whole number, got True"),
         (study_text(seeds="0"), "corridor.toml: seeds must be at least 1, got 0"),
         (study_text(seeds="[1, 1]"), r"corridor.toml: seeds must be a number or different numbers, got \[1, 1\]"),

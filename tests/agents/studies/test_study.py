@@ -10,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from agents.studies.results import write_result
 from agents.study import StudyConfig, run_study
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.jobs import SERVED
-from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, result, study_path, study_text
+from tests.agents.studies import helpers as studies
+from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, study_path, study_text
 
 LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
 """What differs between two runs of one study."""
@@ -303,6 +305,7 @@ def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run = replace(config(tmp_path, study_text(seeds="3", env_id="nowhere:Gone-v0")), report=True)
+    result = partial(studies.result, env_id="nowhere:Gone-v0")
     monkeypatch.setattr("agents.study.run_cells", lambda *_: pytest.fail("nothing is run"))
     with pytest.raises(UserError, match=r"out holds no result of this study \(cells/NAME/result.json\); run it"):
         run_study(run)
@@ -314,6 +317,7 @@ def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
         result("zeros", [80.0], seed=0, scenario="corridor"),
         result("none", [90.0], seed=0, scenario="elsewhere"),
         result("random", [1.0, 1.0], scenario="corridor", provenance={"commit": "old", "time": "2026-01"}),
+        result("none", [50.0], seed=2, scenario="corridor", env_id="merge-v1"),
     ]
     for i, each in enumerate(made):
         folder = tmp_path / "out" / "cells" / f"of-another-version-{i}"

@@ -15,6 +15,7 @@ from predictor.evaluation import displacement as metrics
 from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
 from predictor.evaluation.standard_errors import Statistic
+from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, model, random_presence, random_states, spec
 
 
@@ -401,3 +402,23 @@ def test_samples_depend_on_the_seed_alone():
     assert torch.equal(forecasts(0, everywhere=1), forecasts(0, everywhere=2))
     assert not torch.equal(forecasts(0, everywhere=1), forecasts(1, everywhere=1))
     assert torch.equal(forecasts(0, everywhere=1)[:, 0], forecasts(1, everywhere=1)[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"mode_probs": torch.ones(1, 2, 2)}, "mode_probs must be at least 0 and sum to 1"),
+        ({"mode_probs": torch.tensor([[[1.5, 0.5], [-0.5, 0.5]]])}, "mode_probs must be at least 0 and sum to 1"),
+        ({"mode_probs": torch.full((1, 2, 2), math.nan)}, "mode_probs must be at least 0 and sum to 1"),
+        ({"scale": torch.full((1, 2, 2, 2, 2), -1.0)}, "xy_scale must be finite and at least 0"),
+        ({"scale": torch.full((1, 2, 2, 2, 2), math.nan)}, "xy_scale must be finite and at least 0"),
+    ],
+)
+def test_probabilities_and_scales_that_are_none_are_refused(changes: dict[str, torch.Tensor], words: str):
+    with pytest.raises(UserError, match=words):
+        Tally().add(replace(OUTCOMES[0], **changes))  # type: ignore[arg-type]
+
+
+def test_probabilities_of_absent_agents_do_not_matter():
+    probs = torch.tensor([[[0.25], [0.75]]])
+    Tally().add(replace(OUTCOMES[1], forecast=OUTCOMES[0].forecast[:, :, :1], mode_probs=0 * probs))
