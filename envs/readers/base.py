@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.scene import MOST_AGENTS, PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
+from predictor.support.config_checks import is_whole
 from predictor.support.errors import UserError, short
 from predictor.support.importing import load_named
 
@@ -153,12 +154,23 @@ def check_bounds(perception_m: Any, max_agents: Any) -> None:
     Raises:
         UserError: a value is no positive number, or no whole one.
     """
-    is_number = isinstance(perception_m, int | float | np.integer | np.floating) and not isinstance(perception_m, bool)
+    is_number = is_whole(perception_m) or isinstance(perception_m, float | np.floating)
     if perception_m is not None and not (is_number and perception_m > 0):
         raise UserError(f"perception_m must be a positive number, got {perception_m!r}")
-    is_whole = isinstance(max_agents, int | np.integer) and not isinstance(max_agents, bool)
-    if max_agents is not None and not (is_whole and 1 <= max_agents <= MOST_AGENTS):
+    if max_agents is not None and not (is_whole(max_agents) and 1 <= max_agents <= MOST_AGENTS):
         raise UserError(f"max_agents must be a whole number from 1 to {MOST_AGENTS:,}, got {max_agents!r}")
+
+
+def bounded_spec(spec: SceneSpec, perception_m: float | None, max_agents: int | None) -> SceneSpec:
+    """Returns the spec with what its ego perceives; None leaves the spec's value.
+
+    Raises:
+        UserError: see `check_bounds`.
+    """
+    check_bounds(perception_m, max_agents)
+    if perception_m is not None:
+        spec = replace(spec, perception_m=float(perception_m))
+    return spec if max_agents is None else replace(spec, max_agents=int(max_agents))
 
 
 def check_registration(env_class: Any, make: Any, what: str) -> None:
@@ -183,18 +195,17 @@ def bounded(reader: Any, perception_m: float | None, max_agents: int | None) -> 
     Raises:
         UserError: a value out of range, or a reader that is no `Reader` and has another value.
     """
-    check_bounds(perception_m, max_agents)
-    given = {"perception_m": perception_m, "max_agents": max_agents}
-    given = {name: value for name, value in given.items() if value is not None and value != getattr(reader.spec, name)}
-    if not given:
+    spec = bounded_spec(reader.spec, perception_m, max_agents)
+    if spec == reader.spec:
         return reader
     if not isinstance(reader, Reader):
-        asked = ", ".join(f"{name}={value:g}" for name, value in given.items())
+        given = {"perception_m": spec.perception_m, "max_agents": spec.max_agents}
+        asked = ", ".join(f"{name}={value:g}" for name, value in given.items() if value != getattr(reader.spec, name))
         raise UserError(
             f"{type(reader).__name__} sets what the ego perceives itself, so {asked} has no effect: derive it from "
             "envs.readers.Reader, or make it with these values"
         )
-    reader._spec = replace(reader.spec, **given)  # type: ignore[arg-type]
+    reader._spec = spec
     return reader
 
 

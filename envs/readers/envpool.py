@@ -6,7 +6,6 @@ the list's first vehicle. Parking, lane keeping and the multi-agent intersection
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from operator import attrgetter
 from typing import Any, Protocol
 
@@ -14,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from envs.readers.base import Reader, check_bounds, perceive_batch, policy_step_s
+from envs.readers.base import Reader, bounded_spec, perceive_batch, policy_step_s
 from envs.readers.identity import best_pairs
 from envs.simulators.envpool import HIGHWAY_ENV_OF
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
@@ -63,11 +62,7 @@ def envpool_spec(
     if task_id not in HIGHWAY_ENV_OF:
         raise UserError(f"no scene reader knows EnvPool's task '{task_id}'; known: {', '.join(HIGHWAY_ENV_OF)}")
     frame = _UNBOUNDED_X if task_id in _STRAIGHT_ROADS else _FIXED_MAP
-    check_bounds(perception_m, max_agents)
-    spec = SceneSpec(dt_s=policy_step_s(config), frame=frame)
-    if perception_m is not None:
-        spec = replace(spec, perception_m=float(perception_m))
-    return spec if max_agents is None else replace(spec, max_agents=int(max_agents))
+    return bounded_spec(SceneSpec(dt_s=policy_step_s(config), frame=frame), perception_m, max_agents)
 
 
 class PoolIdentity:

@@ -6,14 +6,13 @@ driver parameters.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.kinematics import Vehicle
 
-from envs.readers.base import Reader, check_bounds, policy_step_s
+from envs.readers.base import Reader, bounded_spec, policy_step_s
 from envs.readers.identity import IdentityDict
 from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
@@ -62,13 +61,8 @@ class HighwayReader(Reader):
             raise UserError(f"HighwayReader needs a highway-env environment, got {env.unwrapped.__class__.__name__}")
         config = env.unwrapped.config  # type: ignore[attr-defined]
         env_id = env.unwrapped.spec.id if env.unwrapped.spec is not None else ""
-        check_bounds(perception_m, max_agents)
         spec = SceneSpec(dt_s=policy_step_s(config), frame=_FRAMES.get(env_id, _FIXED_MAP))
-        if perception_m is not None:
-            spec = replace(spec, perception_m=float(perception_m))
-        if max_agents is not None:
-            spec = replace(spec, max_agents=int(max_agents))
-        super().__init__(spec)
+        super().__init__(bounded_spec(spec, perception_m, max_agents))
         self.reset()
 
     def reset(self) -> None:

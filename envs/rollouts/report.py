@@ -161,9 +161,8 @@ def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
     cells = _matrix(results, misfits)
     lines = [[env_id, *line.values()] for env_id, line in cells.items()]
     title = "transfer: minADE₁ [m] (below constant velocity)"
-    return FittedTable(
-        title, ["env", *next(iter(cells.values()))], lines, "–: not measured, see accuracy.md for the reason"
-    )
+    caption = "–: not measured, see accuracy.md for the reason" if misfits else ""
+    return FittedTable(title, ["env", *next(iter(cells.values()))], lines, caption)
 
 
 def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> dict[str, dict[str, str]]:

@@ -22,6 +22,7 @@ from envs.simulators.envpool import (
     meta_actions_of,
 )
 from predictor.scene import SceneSpec
+from predictor.support.config_checks import is_whole
 from predictor.support.errors import ProtocolError, UserError
 
 
@@ -64,9 +65,9 @@ class EnvPoolVecEnv(VecEnv):
         **settings: Any,
     ) -> None:
         """Builds the pool."""
-        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        if not is_whole(num_envs) or num_envs < 1:
             raise UserError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
-        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
+        if seed is not None and (not is_whole(seed) or seed < 0):
             raise UserError(f"seed must be a whole number from 0 on, got {seed!r}")
         self.task_id, self._num_threads, self._settings = task_id, num_threads, settings
         first = int(np.random.default_rng().integers(MAX_SEED)) if seed is None else seed

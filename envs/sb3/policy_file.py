@@ -185,7 +185,7 @@ def selection_return(best: Path) -> float:
             with zipfile.ZipFile(best) as file:
                 if (part := file.testzip()) is not None:
                     raise zipfile.BadZipFile(f"{part} differs from its checksum")
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except (zipfile.BadZipFile, *_DAMAGED) as error:
         raise UserError(f"{best} is damaged; remove it to go on without it") from error
     return found
 

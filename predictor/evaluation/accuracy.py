@@ -125,7 +125,7 @@ class Tally:
 
         Raises:
             ValueError: the number of samples, steps or axes differs from that of earlier batches.
-            UserError: a forecast that counts is not finite, nor are its probabilities or its scale such.
+            UserError: a forecast that counts is not finite, or its probabilities or its scale are impossible.
         """
         _, samples, _, horizon, axes = outcome.forecast.shape
         counted = outcome.valid.any(dim=-1)[:, None, :, None, None]

@@ -14,6 +14,11 @@ import numpy as np
 from predictor.support.errors import UserError, short
 
 
+def is_whole(value: Any) -> bool:
+    """Returns whether a value is a whole number, of Python or NumPy; True and False are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def check_choices(config: Any) -> None:
     """Checks every field whose type is a `Literal`, also inside an optional or a tuple.
 

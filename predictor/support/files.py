@@ -147,22 +147,27 @@ def check_out(out: Path, only_stores: bool = False) -> None:
     check_place(out)
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; choose another --out")
-    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise UserError(f"{out} cannot be made: no permission to write in {place}; choose another --out")
+    _check_writable(out)
 
 
 def check_out_file(out: Path | None) -> None:
     """Checks that the file of a command's result, if there is one, can be written; called before any work is done.
 
     Raises:
-        UserError: it is a folder, or see `check_place`.
+        UserError: it is a folder, or nothing can be written there.
     """
     if out is None:
         return
     check_place(out)
     if out.is_dir():
         raise UserError(f"{out} is a folder; name a file")
+    _check_writable(out.parent)
+
+
+def _check_writable(folder: Path) -> None:
+    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"{folder} cannot be used: no permission to write in {there}; choose another --out")
 
 
 def check_place(out: Path) -> None:

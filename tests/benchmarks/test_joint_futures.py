@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from benchmarks import joint_futures
+from benchmarks.envpool_parity import untouched_drivers
 from benchmarks.joint_futures import Errors, displacements_of, errors_of
 from predictor.evaluation.outcomes import Outcome
 
@@ -60,3 +61,13 @@ def test_command_plays_the_deployed_wrapper(tmp_path: Path, capsys: pytest.Captu
     assert len(lines) == 2 and (one["agents"], two["agents"]) == (1, 2)
     assert one["joint"] == one["best"] == one["mixed"] <= one["single"]
     assert two["best"] <= two["joint"] <= two["single"]
+
+
+@pytest.mark.slow
+def test_an_environment_does_not_change_the_drivers_of_the_next():
+    """The crossing of highway-env gives all drivers of its process other distances and decelerations."""
+    config = joint_futures.JointConfig(episodes=1, num_samples=2, agents=(1,))
+    before = joint_futures.measure("merge-v1", config)
+    with untouched_drivers():
+        joint_futures.measure("intersection-v2", config)
+        assert before and joint_futures.measure("merge-v1", config) == before

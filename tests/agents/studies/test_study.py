@@ -236,7 +236,8 @@ def test_a_result_tells_of_the_start_of_the_study(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
+@pytest.mark.parametrize("curve", [None, [{"steps": 64, "return": 1.0}]])
+def test_a_run_whose_curve_was_removed_or_cut_still_has_a_result(curve: list[dict[str, float]] | None, tmp_path: Path):
     """A message says to remove it where it is damaged."""
     run = config(tmp_path, study_text(steps="64", selections="1", seeds="1", references="[]"))
     assert run_study(run) == 0
@@ -244,10 +245,12 @@ def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
     before = json.loads((cell / "result.json").read_text())
     (cell / "result.json").unlink()
     (cell / "run" / "curve.json").unlink()
+    if curve is not None:
+        (cell / "run" / "curve.json").write_text(json.dumps(curve))
     (cell / ".result.json.0123456789abcdef.partial.json").write_text("{")  # what a kill left
     assert run_study(run) == 0
     after = json.loads((cell / "result.json").read_text())
-    assert after["episodes"] == before["episodes"] and after["curve"] == [] and after["train_seconds"] == 0
+    assert after["episodes"] == before["episodes"] and after["curve"] == (curve or []) and after["train_seconds"] == 0
     assert not list(cell.glob(".*partial*"))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs import ForecastParallelEnv, make_multiagent_env
+from envs import ForecastParallelEnv, make_multiagent_env, parallel
 from envs.arms import Arm
 from envs.drivers.all_agents import make_driver
 from envs.own_observation import without_added
@@ -149,3 +149,28 @@ def test_where_no_driver_decides_all_agents_keep_on():
         env.step(pushes)
         np.testing.assert_allclose(env.scene.scene.states[:, :2], true[:, step], atol=1e-9)
     env.close()
+
+
+def test_the_oracle_keeps_to_the_actions_that_were_given_even_if_the_environment_changes_them(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    told: list[dict[str, Any]] = []
+    original = parallel.all_keeping_on
+
+    def noting(env: Any, reader: Any, scene: Any, observations: Any, actions: dict[str, Any], steps: int) -> Any:
+        told.append({agent: np.copy(action) for agent, action in actions.items()})
+        return original(env, reader, scene, observations, actions, steps)
+
+    class Clips(BaseParallelWrapper):
+        def step(self, actions: dict[str, Any]) -> Any:
+            found = super().step({agent: action.copy() for agent, action in actions.items()})
+            for action in actions.values():
+                action *= 0
+            return found
+
+    monkeypatch.setattr(parallel, "all_keeping_on", noting)
+    inner = Clips(make_multiagent_env("simple_spread_v3", continuous_actions=True))
+    env = ForecastParallelEnv(inner, "constant-velocity", arm=Arm("oracle"))
+    env.reset(seed=0)
+    env.step({agent: np.full(5, 0.5, dtype=np.float32) for agent in env.agents})
+    assert all((action == 0.5).all() for action in told[-1].values()) and len(told[-1]) == 3

@@ -116,7 +116,8 @@ def test_tables_of_a_terminal_have_units_and_dashes():
     assert "dt [s]" in text and "1.25" in text and "40 to 60 %" in text  # no unit is taken for markup
     matrix = shown(report.transfer([result("a", "x"), result("a", "y")], {("b", "x"): "another dt"}))
     (line,) = [line for line in matrix.splitlines() if line.split("│")[1:2] == [" b   "]]
-    assert line.count("–") == 2
+    assert line.count("–") == 2 and "–: not measured, see accuracy.md" in matrix
+    assert "not measured" not in shown(report.transfer([result("a", "x"), result("a", "y")], {}))
 
 
 def test_long_names_are_broken_and_not_cut():

@@ -557,6 +557,7 @@ def test_every_env_needs_an_action():
     [
         (0, {}, "num_envs must be a whole number from 1 on, got 0"),
         (2.5, {}, "num_envs must be a whole number from 1 on, got 2.5"),
+        (True, {}, "num_envs must be a whole number from 1 on, got True"),
         (1, {"seed": 1.5}, "seed must be a whole number from 0 on, got 1.5"),
         (1, {"seed": -1}, "seed must be a whole number from 0 on, got -1"),
         (1, {"max_agents": 2.7}, "max_agents must be a whole number from 1 to 65,536, got 2.7"),

@@ -7,14 +7,17 @@ import os
 import stat
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from predictor.support import files
-from predictor.support.errors import CannotWriteError
+from predictor.support.errors import CannotWriteError, UserError
 from predictor.support.files import (
+    check_out,
+    check_out_file,
     copy_file,
     delete_leftovers,
     finite,
@@ -181,3 +184,15 @@ def test_where_folders_cannot_be_exchanged_they_are_renamed(tmp_path: Path, monk
         with new_folder(tmp_path / "x") as partial:
             (partial / content).touch()
     assert names(tmp_path) == ["x"] and names(tmp_path / "x") == ["new"]
+
+
+@pytest.mark.parametrize("check", [check_out, check_out_file])
+def test_an_output_without_permission_is_refused_before_the_work(
+    check: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    check(tmp_path / "new" / "out")
+    asked: list[Path] = []
+    monkeypatch.setattr("os.access", lambda place, mode: asked.append(place))
+    with pytest.raises(UserError, match=f"cannot be used: no permission to write in {tmp_path}; choose another --out"):
+        check(tmp_path / "new" / "out")
+    assert asked == [tmp_path], "the folder above, which is there"
