@@ -412,6 +412,7 @@ def test_samples_depend_on_the_seed_alone():
         ({"mode_probs": torch.full((1, 2, 2), math.nan)}, "mode_probs must be at least 0 and sum to 1"),
         ({"scale": torch.full((1, 2, 2, 2, 2), -1.0)}, "xy_scale must be finite and at least 0"),
         ({"scale": torch.full((1, 2, 2, 2, 2), math.nan)}, "xy_scale must be finite and at least 0"),
+        ({"scale": torch.full((1, 2, 2, 2, 2), math.inf)}, "xy_scale must be finite and at least 0"),
     ],
 )
 def test_probabilities_and_scales_that_are_none_are_refused(changes: dict[str, torch.Tensor], words: str):
