@@ -212,7 +212,10 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
         (axes[1, 0], "coverage", "truths within the samples' central 90 %"),
         (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
     ):
-        plot_by_horizon(ax, [a for a in result.lines if getattr(a, quantity)], result.dt_s, quantity, label)
+        if measured := [a for a in result.lines if getattr(a, quantity)]:
+            plot_by_horizon(ax, measured, result.dt_s, quantity, label)
+        else:
+            ax.axis("off")  # one sample covers nothing
     entries = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")

@@ -172,3 +172,14 @@ def test_pictures_are_files_named_by_env_and_checkpoint(cases: int, tmp_path: Pa
         assert min(pixels.shape[:2]) > 300
         assert pixels[..., :3].std() > 0.05
     assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize(("coverage", "shown_panels"), [([], 3), ([0.9, 0.9, 0.9], 4)])
+def test_a_picture_has_no_empty_panel(
+    coverage: list[float], shown_panels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    panels: list[bool] = []
+    monkeypatch.setattr(report, "save_figure", lambda figure, *_: panels.extend(ax.axison for ax in figure.axes))
+    report.write_pictures(tmp_path, replace(result(), model_samples=replace(full().model, coverage=coverage)), [])
+    plt.close("all")
+    assert sum(panels) == shown_panels and len(panels) == 4
