@@ -11,14 +11,12 @@ more informative.
 """
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, ratio_statistics
 
 PairTypes = Int[Tensor, " batch *pairs"]
 """Types of pairs: windows first, then receivers and senders, with or without a time axis between them."""
@@ -61,13 +59,10 @@ class GraphAccuracy:
     """Number of pairs by true type (outer list) and most likely type (inner list), after renaming."""
     permutation: tuple[int, ...] | None = None
     """True type of each of the model's types; the identity unless matched."""
-    statistics: dict[str, Statistic] = field(default_factory=dict)
-    """Mean ± standard error over subsets of the windows, by the names above; the permutation is that of the
-    whole set."""
 
 
 class GraphTally:
-    """Collects confusion counts per window, batch by batch.
+    """Adds up confusion counts, batch by batch.
 
     Example:
         >>> tally = GraphTally(num_types=2)
@@ -85,9 +80,9 @@ class GraphTally:
         if num_types < 1:
             raise ValueError(f"num_types must be at least 1, got {num_types}")
         self.num_types = num_types
-        self._predicted: list[np.ndarray] = []  # windows × types
-        self._confusion: list[np.ndarray] = []  # windows × true × predicted
-        self._brier: list[np.ndarray] = []  # windows × the type taken for "no edge"
+        self._predicted = np.zeros(num_types, dtype=np.int64)
+        self._confusion = np.zeros((num_types, num_types), dtype=np.int64)  # true × predicted
+        self._brier = np.zeros(num_types)  # by the type taken for "no edge"
         self._has_truth: bool | None = None
 
     def add(self, predicted: Predicted, true_types: PairTypes | None, valid: PairMask) -> None:
@@ -111,48 +106,45 @@ class GraphTally:
             valid = valid & (true_types != UNKNOWN)
             self._check(true_types[valid], "true")
         probs, types = self._as_both(predicted.detach().cpu(), valid)
-        self._predicted.append(_count(types, valid, self.num_types))
+        self._predicted += _count(types, valid, self.num_types)
         if true_types is None:
             return
         pair = torch.where(valid, true_types, 0) * self.num_types + types
-        confusion = _count(pair, valid, self.num_types**2)
-        self._confusion.append(confusion.reshape(-1, self.num_types, self.num_types))
+        self._confusion += _count(pair, valid, self.num_types**2).reshape(self._confusion.shape)
         no_edge = (true_types == 0)[..., None].double()
         squared = torch.where(valid[..., None], (probs.double() - no_edge).square(), 0.0)
-        self._brier.append(squared.flatten(1, -2).sum(1).numpy())
+        self._brier += squared.flatten(0, -2).sum(0).numpy()
 
-    def results(self, matched: bool = False, num_subsets: int = NUM_SUBSETS, seed: int = 0) -> GraphAccuracy:
+    def results(self, matched: bool = False) -> GraphAccuracy:
         """Returns the accuracy over all batches that were added.
 
         Args:
             matched: whether to rename the model's types by the permutation of highest accuracy (ties: the identity).
-            num_subsets: number of subsets of windows for the standard errors.
-            seed: random seed of the subsets.
 
         Raises:
             ValueError: `matched` without true types, or with more than `MAX_MATCHED_TYPES` types.
         """
         if matched and not self._has_truth:
             raise ValueError("types can only be matched to true types; add them or pass matched=False")
-        if not self._predicted:
+        if self._has_truth is None:
             return GraphAccuracy(0, None)
         if not self._has_truth:
-            counts = np.concatenate(self._predicted)
-            ratios = {"connectivity": (counts[:, 1:].sum(1), counts.sum(1))}
-            values, statistics = _summary(ratios, num_subsets, seed)
-            return GraphAccuracy(int(counts.sum()), values["connectivity"], statistics=statistics)
-        confusion = np.concatenate(self._confusion)
-        permutation = _best_permutation(confusion.sum(0)) if matched else tuple(range(self.num_types))
-        confusion = confusion[:, :, np.argsort(permutation)]
-        brier = np.concatenate(self._brier)[:, permutation.index(0)]
-        values, statistics = _summary(_ratios(confusion, brier), num_subsets, seed)
-        total = confusion.sum(0)
+            return GraphAccuracy(int(self._predicted.sum()), _ratio(self._predicted[1:].sum(), self._predicted.sum()))
+        permutation = _best_permutation(self._confusion) if matched else tuple(range(self.num_types))
+        confusion = self._confusion[:, np.argsort(permutation)]
+        pairs, hits = confusion.sum(), confusion[1:, 1:].sum()
+        inferred, true = confusion[:, 1:].sum(), confusion[1:].sum()
         return GraphAccuracy(
-            int(total.sum()),
-            **values,
-            confusion=total.tolist() if total.any() else None,
+            int(pairs),
+            connectivity=_ratio(inferred, pairs),
+            accuracy=_ratio(np.trace(confusion), pairs),
+            f1=_ratio(2 * hits, inferred + true),
+            precision=_ratio(hits, inferred),
+            recall=_ratio(hits, true),
+            brier=_ratio(self._brier[permutation.index(0)], pairs),
+            true_connectivity=_ratio(true, pairs),
+            confusion=confusion.tolist() if pairs else None,
             permutation=permutation,
-            statistics=statistics,
         )
 
     def _as_both(self, predicted: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,14 +181,17 @@ def graph_accuracy(
         num_types = 1 + max((int(types.max()) for types in known), default=0)
     tally = GraphTally(num_types)
     tally.add(predicted, true_types, valid)
-    return tally.results(matched, num_subsets=1).accuracy
+    return tally.results(matched).accuracy
 
 
-def _count(types: Tensor, valid: Tensor, num_types: int) -> Int[np.ndarray, "batch types"]:
-    """Counts the valid entries of each window by type."""
-    windows = torch.arange(len(types)).reshape(-1, *[1] * (types.ndim - 1)).expand_as(types)
-    index = (windows * num_types + types)[valid]
-    return torch.bincount(index, minlength=len(types) * num_types).reshape(len(types), num_types).numpy()
+def _count(types: Tensor, valid: Tensor, num_types: int) -> Int[np.ndarray, " types"]:
+    """Counts the valid entries by type."""
+    return torch.bincount(types[valid], minlength=num_types).numpy()
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    """Returns the share; None of nothing."""
+    return float(part / whole) if whole else None
 
 
 def _best_permutation(confusion: Int[np.ndarray, "types types"]) -> tuple[int, ...]:
@@ -205,32 +200,6 @@ def _best_permutation(confusion: Int[np.ndarray, "types types"]) -> tuple[int, .
     if types > MAX_MATCHED_TYPES:
         raise ValueError(f"at most {MAX_MATCHED_TYPES} types can be matched, got {types}")
     return max(itertools.permutations(range(types)), key=lambda p: int(confusion[list(p), range(types)].sum()))
-
-
-def _ratios(confusion: np.ndarray, brier: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Computes numerator and denominator of every measure per window."""
-    pairs, hits = confusion.sum((1, 2)), confusion[:, 1:, 1:].sum((1, 2))
-    inferred, true = confusion[:, :, 1:].sum((1, 2)), confusion[:, 1:].sum((1, 2))
-    return {
-        "connectivity": (inferred, pairs),
-        "accuracy": (np.trace(confusion, axis1=1, axis2=2), pairs),
-        "f1": (2 * hits, inferred + true),
-        "precision": (hits, inferred),
-        "recall": (hits, true),
-        "brier": (brier, pairs),
-        "true_connectivity": (true, pairs),
-    }
-
-
-def _summary(
-    ratios: dict[str, tuple[np.ndarray, np.ndarray]], num_subsets: int, seed: int
-) -> tuple[dict[str, float | None], dict[str, Statistic]]:
-    values = {key: float(n.sum() / d.sum()) if d.sum() else None for key, (n, d) in ratios.items()}
-    found = {
-        key: ratio_statistics(n.astype(np.float64), d.astype(np.float64), num_subsets, seed)
-        for key, (n, d) in ratios.items()
-    }
-    return values, {key: statistic for key, statistic in found.items() if statistic is not None}
 
 
 def edge_entropy(
