@@ -109,7 +109,7 @@ def _better(
     for other, number in enumerate(first.ids.tolist()):
         if other == row or rule.error(first.states[other], new) > max(0.1 * error, 2 * rule.typical_m):
             continue
-        least = max(rule.handed_m, 0.5 * error)
+        least = max(rule.handed_m, 0.75 * error)
         elsewhere = number not in rows or rule.error(first.states[other], second.states[rows[number]]) > least
         axes = slice(rule.axes, 2 * rule.axes)
         changes = [float(np.linalg.norm(new[axes] - first.states[each][axes])) for each in (other, row)]

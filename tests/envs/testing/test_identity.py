@@ -17,6 +17,11 @@ RAMMED_AND_SLOWER = (
     ((212.24, 4.28, 14.59, -0.73), (224.23, 4.99, 6.18, -0.19)),
 )
 """Seed 330,072 of highway-fast-v0: the first is then about as fast as the second was, and where it should be."""
+RAMMED_AND_BOTH_SLOWER = (
+    ((635.98, 7.70, 29.98, 1.05), (658.64, 9.21, 11.60, 0.19)),
+    ((641.84, 7.58, 17.02, 1.14), (655.37, 7.09, 6.98, 0.28)),
+)
+"""Seed 100,001 of highway-mixed-v0: the second is then half as far off its course as the first."""
 Pair = tuple[tuple[tuple[float, ...], ...], ...]
 SPEC = HIGHWAY_SPEC
 
@@ -37,7 +42,7 @@ def episode(rammed: Pair = RAMMED) -> Episode:
     return Episode(moments)
 
 
-@pytest.mark.parametrize("rammed", [RAMMED, RAMMED_AND_SLOWER])
+@pytest.mark.parametrize("rammed", [RAMMED, RAMMED_AND_SLOWER, RAMMED_AND_BOTH_SLOWER])
 def test_a_vehicle_that_runs_into_another_keeps_its_id(rammed: Pair):
     assert identity_problems([episode(rammed)], SPEC) == []
 
