@@ -77,6 +77,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._own_spaces, self._unchecked = own, {"reset", "step"}
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
+        self._ego_id: int | None = None
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
         self._played: int | None = 0
@@ -131,7 +132,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             check_own(self._own_spaces, obs, f"env '{self.scene_source}'")
             self._unchecked.remove("reset")
         self.reader.reset()
-        self._over = False
+        self._over, self._ego_id = False, None
         return self._observe(obs), self._with_plans(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -169,6 +170,14 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         name, spec = f"scene reader of '{self.scene_source}'", self.reader.spec
         scene = require_scene(self.reader.read(self.env), name)
         scene.check(name, spec, agents=spec.max_agents)
+        if spec.has_ego:
+            first = int(scene.ids[0])
+            if self._ego_id not in (None, first):
+                raise UserError(
+                    f"{name}: the first agent was {self._ego_id} and is now {first}; it must be the ego until the "
+                    "episode ends: leave an ego that is gone where it was, at rest, or end the episode"
+                )
+            self._ego_id = first
         self._scene = scene.copy()  # a reader may give the simulator's own arrays, into which the next reset writes
         return {**own_entries(obs), **scene_entries(self._scene)}
 

@@ -19,8 +19,8 @@ from predictor.support.errors import UserError, short, some
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
-LARGEST = 1e30
-"""Largest size of a state; single precision holds it, and differences of two."""
+LARGEST = np.float64(1e30)
+"""Largest size of a state; single precision holds it, and differences of two. (As a float it were inf in float16.)"""
 PADDING_ID = -1
 MOST_AGENTS = 65_536
 """Largest number of agents of a scene."""
@@ -188,7 +188,7 @@ class Scene:
         """
         self._check_arrays(source, spec, agents)
         if (spec is None or spec.has_ego) and not (len(self.valid) and self.valid[0]):
-            raise UserError(f"{source}: agent 0 must be the ego, but it is not valid")
+            raise UserError(f"{source}: agent 0 must be the ego, but it is absent or not valid")
         live = self.ids[self.valid].tolist()
         if len(set(live)) != len(live):
             raise UserError(f"{source}: ids must be unique within a scene, got {short(live)}")

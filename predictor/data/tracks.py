@@ -37,6 +37,7 @@ from predictor.data.loading import (
     read_lines,
 )
 from predictor.data.store import Episode
+from predictor.data.track_doubts import doubts
 from predictor.data.track_points import TrackPoints, cut_episodes, with_velocities
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
@@ -53,6 +54,8 @@ MAX_AGENTS = 128
 """Least `max_agents` of a store; larger where more agents are present at once."""
 FAR_M = 10_000.0
 """Files whose mean position is farther than half of this from zero are moved by a multiple of it [m]."""
+COARSEST_M = 0.01
+"""Largest distance between neighbouring numbers of float32 at which positions are kept [m]."""
 RIGHTS = "Those of the source, which the files do not name: a store made from it falls under the same terms."
 
 _COMMENT = re.compile("[#%]")
@@ -116,6 +119,14 @@ class Recording:
         """Greatest number of which all distances between frames are multiples; 0 with fewer than two frames."""
         return int(np.gcd.reduce(np.diff(np.unique(self.frames)), initial=0))
 
+    @property
+    def track_distance(self) -> int:
+        """The commonest number of frames from one line of a track to its next; 0 if no track has two lines."""
+        order = np.lexsort((self.frames, self.ids))
+        apart = np.diff(self.frames[order])[np.diff(self.ids[order]) == 0]
+        values, counts = np.unique(apart, return_counts=True)
+        return int(values[counts.argmax()]) if len(values) else 0
+
 
 def read_recording(path: Path, config: TracksConfig, counts: Counter[str]) -> Recording:
     """Reads one file.
@@ -160,9 +171,12 @@ def _words(text: str) -> list[str]:
 def _chosen(path: Path, number: int, words: list[str], config: TracksConfig) -> list[str]:
     wanted = config.columns + config.extra_columns
     if len(words) < max(wanted):
+        hint = (
+            "; commas separate columns: numbers need a decimal point" if any(len(w.split()) > 1 for w in words) else ""
+        )
         raise bad_line(
             path, number, f"expected at least {max(wanted)} columns (frame, id, x, y are {config.columns}), "
-            f"got {len(words)}",
+            f"got {len(words)}{hint}",
         )  # fmt: skip
     return [words[column - 1] for column in wanted]
 
@@ -187,8 +201,15 @@ def common_frame_step(recordings: Mapping[Path, Recording]) -> int:
     """Returns the number of frames from one step to the next, which all recordings have in common.
 
     Raises:
-        UserError: they differ.
+        UserError: they differ, or the tracks of one go on in other steps.
     """
+    for path, recording in recordings.items():
+        distance, common = recording.frame_distance, recording.track_distance
+        if common not in (0, distance):
+            raise UserError(
+                f"frames of {path} are {distance} apart, but most lines of its tracks follow after {common}; pass "
+                f"--frame-step {common}, or the number of frames in a step of dt_s"
+            )
     found = {path: r.frame_distance for path, r in recordings.items() if r.frame_distance}
     for path, distance in found.items():
         first = next(iter(found))
@@ -201,13 +222,24 @@ def common_frame_step(recordings: Mapping[Path, Recording]) -> int:
 
 
 def points_of(recording: Recording, frame_step: int, config: TracksConfig, counts: Counter[str]) -> TrackPoints:
-    """Returns the states of a recording at every `frame_step`-th frame, counted from its first one."""
+    """Returns the states of a recording at every `frame_step`-th frame, counted from its first one.
+
+    Raises:
+        UserError: positions are so far apart that float32 does not tell neighbouring ones apart.
+    """
     since = recording.frames - recording.frames.min()
     kept = since % frame_step == 0
     counts["lines dropped: between steps"] += int((~kept).sum())
     positions_m, moved = near_zero(recording.values[kept, :2] * config.scale)
     if moved:
         counts[f"files moved towards zero by multiples of {FAR_M / 1000:g} km"] += 1
+    farthest_m = np.abs(positions_m).max(initial=0.0)
+    coarse_m = np.spacing(np.float32(farthest_m))
+    if coarse_m > COARSEST_M:
+        raise UserError(
+            f"positions lie up to {farthest_m:.3g} m from their mean, where float32 has steps of {coarse_m:.2g} m; "
+            "check --scale and --columns, or split the file by place"
+        )
     points = TrackPoints(since[kept] // frame_step, recording.ids[kept], positions_m)
     moving, velocities_mps, origin = with_velocities(points, config.dt_s)
     counts["lines dropped: no velocity (first of a track or after a gap)"] += len(points) - len(moving)
@@ -291,7 +323,8 @@ def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
         For each part, its episodes and the notes for its card.
 
     Raises:
-        UserError: a file is broken, files differ in the distance of their frames, or a part has no episode.
+        UserError: a file is broken, files differ in the distance of their frames, positions are too far apart, or a
+            part has no episode.
     """
     counts: list[Counter[str]] = [
         Counter({"files": len(part.files), f"files of split '{part.config.split}'": len(part.chosen)}) for part in parts
@@ -303,7 +336,10 @@ def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
     for part, found in zip(parts, counts, strict=True):
         episodes: list[Episode] = []
         for path in part.chosen:
-            points = points_of(recordings[path], frame_step, part.config, found)
+            try:
+                points = points_of(recordings[path], frame_step, part.config, found)
+            except UserError as error:
+                raise UserError(f"{path}: {error}") from error
             label = label_of(path, part.config.source)
             episodes += cut_episodes(points, part.config.episode_steps or _whole_length(points), label, found)
         numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
@@ -353,6 +389,8 @@ def main() -> None:
     for part, (episodes, notes) in zip(parts, loaded, strict=True):
         save_dataset(part.config, scene_spec(part.config, agents), episodes, notes, part.files)
         print(summary(part.config, episodes))
+        for doubt in doubts(episodes, notes.counts):
+            print(f"warning: {doubt}")
     for path in files_beside(config):
         print(f"warning: {path} is in none of the folders {', '.join(FOLDERS)}, and in no store")
 

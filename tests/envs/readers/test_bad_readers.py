@@ -95,7 +95,15 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "twins": ({"ids": np.array([0, 8, 8])}, r"ids must be unique within a scene, got \[0, 8, 8\]"),
     "negative_id": ({"ids": np.array([0, 8, -2])}, r"ids of valid agents must be non-negative, got \[0, 8, -2\]"),
     "padding_id": ({"ids": np.array([0, 8, PADDING_ID])}, r"ids of valid agents must be non-negative"),
-    "no_ego": ({"valid": np.array([False, True, True])}, "agent 0 must be the ego, but it is not valid"),
+    "no_ego": ({"valid": np.array([False, True, True])}, "agent 0 must be the ego, but it is absent or not valid"),
+    "nobody": (
+        {"states": np.zeros((0, 4)), "ids": np.zeros(0, np.int64), "valid": np.zeros(0, np.bool_)},
+        "agent 0 must be the ego, but it is absent or not valid",
+    ),
+    "infinite_in_half_precision": (
+        {"states": (GOOD["states"] + [[0, 0, 0, 0], [np.inf, 0, 0, 0], [0, 0, 0, 0]]).astype(np.float16)},
+        "states must be finite",
+    ),
     "nan": ({"states": GOOD["states"] * [1, 1, np.nan, 1]}, r"states must be finite, .*got \[\[.*nan"),
     "infinite": ({"states": GOOD["states"] + [np.inf, 0, 0, 0]}, "states must be finite"),
     "nan_heading": ({"heading_rad": float("nan")}, "heading_rad must be .*finite.*, got nan"),
@@ -177,6 +185,29 @@ def test_arrays_of_unequal_length_are_named():
     for fields in ({"ids": np.arange(4)}, {"states": np.zeros((2, 4))}, {"valid": np.ones(5, dtype=np.bool_)}):
         with pytest.raises(UserError, match="states, ids and valid need one entry per agent, got"):
             through_a_function(lambda fields=fields: raw_scene(**fields)).reset(seed=0)
+
+
+def test_the_ego_stays_the_first_agent_until_the_episode_ends():
+    """A reader that returns only who is alive makes another agent the ego once the ego is gone."""
+    alive = [GOOD["ids"]] * 4 + [np.array([8, 3])]
+    env = through_a_function(
+        lambda: raw_scene(
+            **{k: v[-len(alive[0]) :] for k, v in GOOD.items() if k != "ids" and np.ndim(v)}, ids=alive.pop(0)
+        )
+    )
+    env.reset(seed=0)
+    env.step(0)
+    env.reset(seed=0)
+    env.step(0)
+    with pytest.raises(UserError, match="^scene reader of 'Room': the first agent was 0 and is now 8; it must be"):
+        env.step(0)
+
+
+def test_an_ego_has_another_id_in_another_episode():
+    ids = [np.array([0, 8, 3]), np.array([5, 8, 3])]
+    env = through_a_function(lambda: raw_scene(ids=ids.pop(0)))
+    env.reset(seed=0)
+    assert env.reset(seed=0)[0]["scene_ids"].tolist() == [5, 8, 3, PADDING_ID]
 
 
 def crowd(agents: int) -> Scene:

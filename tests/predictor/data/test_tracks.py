@@ -268,6 +268,14 @@ def test_one_file_or_another_pattern(source: Path, walk: Path, loader: Loader):
 ROW_ERRORS = {
     "columns": ("790 4 102", "expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 3"),
     "mixed separators": ("790 4,102 50", "expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 2"),
+    "decimal commas": (
+        "790 4 102,5 50,5",
+        "expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 3; commas",
+    ),
+    "too few with commas": (
+        "790,4,102",
+        "expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 3; repair",
+    ),
     "empty column": ("790,4,,50", "x must be a finite number, got ''"),
     "names in the middle": ("frame id x y", "frame must be a finite number, got 'frame'"),
     "nan": ("790 4 nan 50", "x must be a finite number, got 'nan'"),
@@ -308,6 +316,42 @@ def test_files_need_a_frame_step_in_common(source: Path, walk: Path, loader: Loa
     message = f"frames of {other} are 6 apart, those of {walk} 10; pass --frame-step"
     loader.refuses(source, message)
     assert len(loader.load(source, "--frame-step", 10).episodes) == 1  # of the other file, frames 0 and 30 are kept
+
+
+@pytest.mark.parametrize("where", [785, 815])
+def test_one_frame_between_the_others_does_not_change_the_step(where: int, source: Path, walk: Path, loader: Loader):
+    """The greatest common divisor of all frames would be 5: nearly every line would have no predecessor."""
+    walk.write_text(text_of([*WALK, (where, 7, 0, 0)]))
+    message = f"frames of {walk} are 5 apart, but most lines of its tracks follow after 10; pass --frame-step 10"
+    loader.refuses(source, message)
+    (episode,) = loader.load(source, "--frame-step", 10).episodes
+    assert episode.ids.tolist() == [2, 4]
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30])
+def test_positions_that_float32_cannot_tell_apart_are_refused(far: float, source: Path, walk: Path, loader: Loader):
+    walk.write_text(text_of([*WALK, *((780 + 10 * t, 9, far + t, 0) for t in range(4))], form=".9g"))
+    loader.refuses(source, f"{walk}: positions lie up to ")
+
+
+def test_what_is_probably_wrong_is_said(source: Path, walk: Path, loader: Loader, capsys: pytest.CaptureFixture[str]):
+    def said(rows: Sequence[Row]) -> list[str]:
+        walk.write_text(text_of(rows))
+        words = ["tracks", "--source", str(source), "--out", str(loader.store), "--overwrite"]
+        loader.monkeypatch.setattr(sys, "argv", words)
+        tracks.main()
+        return [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+
+    loader.run(source)
+    assert said(WALK) == []
+    (jump,) = said([(f, i, x + 100 * (f == 800) * (i == 4), y) for f, i, x, y in WALK])
+    assert jump.startswith(
+        "warning: agent 4 of 'walk' moves at 255 m/s (episode 0, step 1); check its lines, --columns"
+    )
+    (lost,) = said([(f, i + f * (f > 800), x, y) for f, i, x, y in WALK])
+    assert lost.startswith(
+        "warning: only 3 of 9 lines are in episodes (lines dropped: no velocity (first of a track or"
+    )
 
 
 def test_files_without_tracks(source: Path, walk: Path, loader: Loader):
