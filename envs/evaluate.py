@@ -140,6 +140,8 @@ class EvaluateConfig:
         Raises:
             UserError: a value out of range, or two checkpoints of one name.
         """
+        if not self.env_ids:
+            raise UserError("give at least one of --env-ids")
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
         check_at_least(self, 1, "perturbations", "most_episodes")
         check_at_least(self, 0, "seed")
@@ -189,6 +191,11 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
         None if given is None else names.get(given), config.env_kwargs,
     )  # fmt: skip
     if not result.model.agents:
+        if config.max_steps < horizon:
+            raise UserError(
+                f"{env_id}: no forecast has {horizon} steps of truth, as --max-steps {config.max_steps} ends them "
+                "before; raise it, or lower --horizon-steps"
+            )
         raise UserError(
             f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps, add episodes, or raise "
             f"perception_m={spec.perception_m:g} if the ego sees nobody"
@@ -244,7 +251,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     """Evaluates all checkpoints in all environments; writes each one's files under `config.out`.
 
     Returns:
-        The results, and the reason for each (env, checkpoint) of a transfer matrix that was not measured.
+        The results, and the reason for each (env, checkpoint) that was not measured.
     """
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
@@ -257,9 +264,10 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
             except EnvironmentFailedError:
                 raise
             except UserError as error:
-                if len(config.checkpoint) < 2 or checkpoint is None:
+                if len(config.env_ids) * len(config.checkpoint or (None,)) == 1:
                     raise
-                misfits[env_id, names_of(config.checkpoint)[checkpoint]] = str(error)
+                name = names_of(config.checkpoint)[checkpoint] if checkpoint else checkpoint_for(env_id)
+                misfits[env_id, name] = str(error)
                 continue
             results.append(result)
             console.print(accuracy_table(result.lines, result.dt_s, report.title(result)))
@@ -282,7 +290,7 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
         if config.reactions or config.graph:
             check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
         if config.plans:
-            check_has_plans(env_id, config.env_kwargs)
+            check_has_plans(env_id, config.env_kwargs, "idle" if driver.endswith(".zip") else driver)
     shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
     if config.reactions:
         for env_id in drivers:
@@ -375,6 +383,9 @@ def main() -> None:
         misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
         write_json(config.out / "accuracy.json", finite(content | {"misfits": misfit, "provenance": made}))
         write_text(config.out / "accuracy.md", report.markdown(results, misfits))
+    if misfits and len(config.checkpoint) < 2:
+        kept = f"; all else is in {config.out}" if config.out is not None else ""
+        raise UserError(f"not measured: {'; '.join(misfits.values())}{kept}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ module is imported, so such a name is code.
 """
 
 import copy
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import CellType, FunctionType
@@ -46,22 +47,25 @@ class OwnDriver:
             UserError: the user's function raised, or returned something that is no driver.
         """
         if self._act is None:
-            with self._named():
+            with self._named("is called as function(env, rng)"):
                 self._act = self._make(self._env, self._rng)
             if not callable(self._act):
                 raise UserError(
                     f"driver '{self._name}' must give a function from observations to actions, got "
                     f"{type(self._act).__name__}"
                 )
-        with self._named():
+        with self._named("gives a function that is called with an observation"):
             return self._act(observation)
 
     @contextmanager
-    def _named(self) -> Iterator[None]:
-        """Says whose code it was that raised."""
+    def _named(self, how: str) -> Iterator[None]:
+        """Says whose code it was that raised; of a function that does not take its arguments, how it is called."""
         try:
             yield
         except Exception as error:
+            raised_in = traceback.extract_tb(error.__traceback__)[-1].filename
+            if isinstance(error, TypeError) and raised_in == __file__:
+                raise UserError(f"driver '{self._name}' {how}: {error}") from error
             raise UserError(f"driver '{self._name}' failed: {reason_of(error)}") from error
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OwnDriver":

@@ -118,6 +118,10 @@ def attributes_of(path: Path, format: str) -> dict[str, Any]:
     try:
         content = read_object(path / METADATA, MOST_METADATA_BYTES)
     except NoSuchFile as error:
+        if not exists(path):
+            raise UserError(
+                f"no episode store at {short(address(path))}; make one with python -m envs.collect"
+            ) from error
         raise UserError(f"{short(path)} is not an episode store (it has no {METADATA}); see docs/datasets") from error
     if content.get("zarr_format") != 3 or content.get("node_type") != "group":
         raise UserError(

@@ -57,6 +57,16 @@ def shoves(env: Any, rng: np.random.Generator) -> Callable[[Any], dict[str, int]
     return lambda observations: {agent: int(rng.integers(5)) for agent in env.agents if agent in observations}
 
 
+def takes_nothing() -> Callable[[Any], int]:
+    """A driver's function without the arguments that it is called with."""
+    return lambda observation: 1
+
+
+def sees_nothing(env: gym.Env, rng: np.random.Generator) -> Callable[[], int]:
+    """A driver without the observation."""
+    return lambda: 1
+
+
 def a_number(env: Any, rng: np.random.Generator) -> int:
     """No driver."""
     return 3

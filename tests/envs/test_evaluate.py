@@ -1,3 +1,4 @@
+import json
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -316,8 +317,28 @@ def test_worst_cases_are_of_different_episodes_worst_first(in_process: None):
 
 def test_episodes_too_short_are_named(in_process: None):
     assert measure(TAG, STILL, max_steps=2, horizon_steps=2).model.agents > 0
-    with pytest.raises(UserError, match=f"{TAG}: no forecast has 3 steps of truth; lower --horizon-steps"):
+    with pytest.raises(UserError, match=f"{TAG}: no forecast has 3 steps of truth, as --max-steps 2 ends them before"):
         measure(TAG, STILL, max_steps=2, horizon_steps=3)
+
+
+def test_of_several_environments_one_that_cannot_be_measured_costs_no_other(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    words = ["--env-ids", TAG, ROAD, "--checkpoint", STILL, "--episodes", "1", "--max-steps", "6", "--num-samples", "2"]
+    words += ["--workers", "1", "--out", str(tmp_path)]
+    played = evaluate.evaluate_env
+
+    def fail_on_the_road(config: Any, env_id: str, checkpoint: str) -> Any:
+        if env_id == ROAD:
+            raise UserError(f"{ROAD}: no forecast")
+        return played(config, env_id, checkpoint)
+
+    monkeypatch.setattr(evaluate, "evaluate_env", fail_on_the_road)
+    code, errors, _ = run_command(evaluate.main, words, monkeypatch, capsys)
+    assert (code, errors) == (2, [f"error: not measured: {ROAD}: no forecast; all else is in {tmp_path}"])
+    written = json.loads((tmp_path / "accuracy.json").read_text())
+    assert [result["env_id"] for result in written["results"]] == [TAG]
+    assert written["misfits"] == [{"env_id": ROAD, "checkpoint": STILL, "why": f"{ROAD}: no forecast"}]
 
 
 # --- Whole runs -------------------------------------------------------------------------------------------------------
@@ -442,9 +463,13 @@ ERRORS = {
     "unfit-ego": (["--driver", "keep-lane"], "keep-lane needs continuous steering"),
     "unknown-ego": (["--driver", "reckless"], "driver must be one of random"),
     "unfit-driver": (["--env-ids", TAG, "--driver", "keep-lane"], "driver must be one of random"),
-    "no-neighbours": (["--data", "nowhere"], "nowhere is not an episode store (it has no zarr.json)"),
+    "no-neighbours": (["--data", "nowhere"], "no episode store at nowhere; make one"),
     "no-store": (["--data", "."], ". is not an episode store (it has no zarr.json)"),
-    "too-short": (["--max-steps", "1", "--episodes", "1"], f"{ROAD}: no forecast has 5 steps of truth"),
+    "too-short": (
+        ["--max-steps", "1", "--episodes", "1"],
+        f"{ROAD}: no forecast has 5 steps of truth, as --max-steps 1",
+    ),
+    "no-env": (["--env-ids"], "give at least one of --env-ids"),
 }
 
 
@@ -493,7 +518,7 @@ def test_missing_neighbours_are_no_misfit_of_a_checkpoint(
     arguments = ["--env-ids", ROAD, "--checkpoint", STILL, highway_checkpoint, "--data", "nowhere"]
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith("error: nowhere is not an episode store (it has no zarr.json)")
+    assert errors[0].startswith("error: no episode store at nowhere; make one")
 
 
 def test_an_environment_that_fails_is_no_misfit(monkeypatch: pytest.MonkeyPatch):

@@ -99,7 +99,7 @@ ERRORS = {
     "no-copies": (["--env-ids", TAG, "pursuit_v5"], "raw_env cannot be perturbed; use an environment of highway-env"),
     "zero": (["--perturbations", "0"], "perturbations must be at least 1, got 0"),
     "no-episodes": (["--most-episodes", "0"], "most_episodes must be at least 1, got 0"),
-    "no-store": (["--data", "nowhere"], "nowhere is not an episode store (it has no zarr.json)"),
+    "no-store": (["--data", "nowhere"], "no episode store at nowhere; make one"),
     "no-copies-for-a-graph": (["--graph", "--env-ids", "pursuit_v5"], "raw_env cannot be perturbed"),
     "no-plans": (["--plans", "--env-ids", TAG], "plans are those of one ego, and simple_tag_v3 has several"),
     "no-effect-of-memory": (["--memory-steps", "5"], "memory_steps has no effect on reactions; leave it out"),

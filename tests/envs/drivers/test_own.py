@@ -181,11 +181,16 @@ def test_a_name_that_stands_for_nothing_is_one_sentence(env_id: str, make: Any, 
         make(name, env, np.random.default_rng(0))
 
 
+CODE = "own:tests.envs.own_code:"
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
         (NUMBER, f"driver '{NUMBER}' must give a function from observations to actions, got int"),
         (RAISES, f"highway-fast-v0, seed 0, step 1: driver '{RAISES}' failed: KeyError: 'goal'"),
+        (f"{CODE}takes_nothing", r"is called as function\(env, rng\): takes_nothing\(\) takes 0 positional arguments"),
+        (f"{CODE}sees_nothing", "gives a function that is called with an observation: .* takes 0 positional arguments"),
         (f"{RAISES}_later", f"highway-fast-v0, seed 0, step 1: driver '{RAISES}_later' failed: KeyError: 'goal'"),
     ],
 )

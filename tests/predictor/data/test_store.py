@@ -206,7 +206,7 @@ def test_info_is_read_without_the_arrays(tmp_path: Path):
     for name in ("states", "valid"):
         shutil.rmtree(tmp_path / "store" / name / "c")
     assert read_info_of(tmp_path / "store") == replace(INFO, num_steps=7)
-    with pytest.raises(UserError, match=r"nowhere is not an episode store"):
+    with pytest.raises(UserError, match=r"no episode store at .*nowhere; make one"):
         read_info_of(tmp_path / "nowhere")
 
 
