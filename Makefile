@@ -9,6 +9,8 @@ EXTRAS ?= core scores envs rl study contrib tune hub ray envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
+# Two installations at once into one environment damage it.
+.NOTPARALLEL:
 .PHONY: help .venv train test test-all test-shapes test-cluster storm soak sbom fuzz check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets

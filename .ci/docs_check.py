@@ -245,7 +245,8 @@ class Page:
             if process.returncode:
                 return f"{printed}\nexit status {process.returncode}"
             pairs = [line.partition("=") for line in Path(exported.name).read_text().split("\0") if line]
-            self.environment = {name: value for name, _, value in pairs}
+            if pairs:  # none after a block that ends with `exit`
+                self.environment = {name: value for name, _, value in pairs}
         return ""
 
     def _run_python(self, code: str, where: str) -> str:
@@ -334,10 +335,10 @@ def _run_page(
     if time.monotonic() >= last_start:
         return [_left_out(block) for block in blocks]
     with tempfile.TemporaryDirectory() as folder:
-        copy_tree(Path(folder))
         page = Page(Path(folder), limit_s, jobs)
-        opened.append(page)
+        opened.append(page)  # so that Ctrl-C finds it while it is being copied
         try:
+            copy_tree(Path(folder))
             return [page.run(block) for block in blocks if not page.stopped]
         finally:
             page.close()
@@ -371,6 +372,9 @@ def main() -> int:
     if arguments.jobs < 1:
         parser.error(f"--jobs must be at least 1, got {arguments.jobs}")
     within_s = math.inf if arguments.within is None else arguments.within
+    for option, value in (("--limit-s", arguments.limit_s), ("--within", within_s)):
+        if not value > 0:
+            parser.error(f"{option} must be positive, got {value:g}")
     if arguments.within is not None:
         pages = shuffled(pages)
     results = []

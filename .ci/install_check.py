@@ -6,6 +6,7 @@ which a command could otherwise use without declaring them. `--only core envs` t
 """
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -162,8 +163,9 @@ def run(command: Sequence[str | Path], folder: Path) -> None:
         RuntimeError: the command failed; the message ends with the last lines of its output.
     """
     done = subprocess.run(
-        [str(part) for part in command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+        [str(part) for part in command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+    )  # fmt: skip
     if done.returncode:
         tail = "\n".join(done.stdout.splitlines()[-25:])
         raise RuntimeError(f"{' '.join(map(str, command[1:]))}\nended with status {done.returncode}:\n{tail}")

@@ -103,7 +103,12 @@ def read_advisories(path: Path = ADVISORIES) -> list[Advisory]:
     """
     found = []
     with path.open(encoding="utf-8", newline="") as file:
-        for number, line in enumerate(csv.DictReader(file), start=2):
+        lines = csv.DictReader(file)
+        if not {"package", "id", "cve", "affected", "source"} <= set(lines.fieldnames or ()):
+            raise SbomError(
+                f"{path.name}:1: expected the columns package, id, cve, affected, source, got {lines.fieldnames}"
+            )
+        for number, line in enumerate(lines, start=2):
             name = line["id"] or line["cve"]
             if not (line["package"] and name and line["affected"] and line["source"]):
                 raise SbomError(f"{path.name}:{number}: expected package, id or cve, affected and source, got {line}")

@@ -148,7 +148,9 @@ class Task:
         if self.observe in ARMS:
             Arm(self.observe).check_room(self.num_samples, self.what_if)
         for name in ("crash_key", "success_key"):
-            if getattr(self, name) == "" or (getattr(self, name) is not None and self.is_multiagent):
+            if getattr(self, name) == "":
+                raise UserError(f"{name} must be a key of the infos, got ''; leave it out, or name one")
+            if getattr(self, name) is not None and self.is_multiagent:
                 raise UserError(f"{name} is a key of the infos of an environment with one ego; leave it out")
         if self.make_kwargs and self.backend == "envpool":
             raise UserError("env_kwargs are for the gymnasium backend; leave them or backend envpool out")

@@ -25,6 +25,7 @@ def main() -> None:
     """Runs the command."""
     settings = parse(Settings, __doc__)
     settings.check_files()
+    settings.check_env()
     if settings.reference is not None:
         from benchmarks.reference import load
 

@@ -172,6 +172,8 @@ def main() -> None:
     table = Table(title=f"identity from motion, random ego, seed {config.seed}")
     for heading in ("env", "vehicle steps", "correct", "id switches", "split", "wrong", "episodes"):
         table.add_column(heading, justify="left" if heading == "env" else "right")
+    for env_id in config.replay:  # raises before any is played
+        make_env(env_id).close()
     counts = [(f"envpool {task_id}", count_envpool(task_id, config)) for task_id in config.task_ids]
     counts += [(f"highway-env {env_id}", count_replay(env_id, config)) for env_id in config.replay]
     for name, count in counts:

@@ -6,6 +6,7 @@ same random actions, and reports by how much vehicles differ in position. Then i
 simulators and, with `--policy`, the results of one trained policy in both.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -20,7 +21,7 @@ from rich.table import Table
 
 from agents.summaries import mean_and_standard_error
 from envs.drivers.ego import make_ego_driver
-from envs.drivers.trained import sees_forecasts
+from envs.drivers.trained import kept_policy, sees_forecasts
 from envs.readers import reader_for
 from envs.registry import make_env
 from envs.seeding import driver_rng
@@ -75,6 +76,10 @@ class ParityConfig:
             raise UserError(f"cannot compare {', '.join(unknown)}: unknown, or without other vehicles")
         if _CONTINUOUS in self.task_ids:
             raise UserError(f"cannot compare {_CONTINUOUS}: its actions are continuous; compare Intersection-v0")
+        if self.checkpoint is not None and self.policy is None:
+            raise UserError("checkpoint is what a policy sees; give --policy, or leave it out")
+        if self.policy is not None and not self.episodes:
+            raise UserError("policy has no effect without episodes; leave out --episodes 0")
         check_out_file(self.out)
 
 
@@ -240,6 +245,27 @@ def _for_policy(env: gym.Env, config: ParityConfig) -> gym.Env:
     return ForecastObservation(env, config.checkpoint) if sees_forecasts(str(config.policy)) else env
 
 
+def check_drivers(config: ParityConfig) -> None:
+    """Checks, before minutes of work, that each driver drives in each simulator.
+
+    Raises:
+        UserError: an unknown driver, or a policy that was not trained on observations such as these.
+    """
+    for task_id in config.task_ids:
+        for env_id in (_env_id(task_id), HIGHWAY_ENV_OF[task_id]):
+            env = make_env(env_id, disable_env_checker=True)
+            for driver in config.driver:
+                make_ego_driver(driver, env, driver_rng(config.seed))
+            if config.policy is not None:
+                seen, trained = _for_policy(env, config).observation_space, kept_policy(str(config.policy))
+                if trained.observation_space != seen:
+                    raise UserError(
+                        f"{config.policy} sees other observations than {env_id} gives here: those of "
+                        "train_policy.py with --observe forecast (one sample, no plans), or none"
+                    )
+            env.close()
+
+
 # --- Report -----------------------------------------------------------------------------------------------------------
 
 
@@ -280,8 +306,8 @@ def episodes_table(task_id: str, driver: str, both: Sequence[tuple[str, Episodes
     for name, seen in both:
         cells = [mean_and_standard_error(list(map(float, v))) for v in (seen.returns, seen.crashed)]
         spread = (seen.lengths, seen.vehicles, seen.near, seen.nearest_m, seen.speed_mps)
-        cells += [(float(np.mean(v)), float(np.std(v))) for v in spread]
-        numbers = [f"{mean:.2f} ± {around:.2f}" for mean, around in cells]
+        cells += [(float(np.mean(v)), float(np.std(v))) if v else (math.nan, math.nan) for v in spread]
+        numbers = [" ± ".join("–" if math.isnan(n) else f"{n:.2f}" for n in cell) for cell in cells]
         table.add_row(name, *numbers, str(seen.starts))
     return table
 
@@ -289,8 +315,7 @@ def episodes_table(task_id: str, driver: str, both: Sequence[tuple[str, Episodes
 def main() -> None:
     """Runs the command."""
     config = parse(ParityConfig, __doc__)
-    if config.policy is not None:
-        sees_forecasts(str(config.policy))  # raises before minutes of work
+    check_drivers(config)
     console = Console(width=140)
     results: dict[str, Any] = {}
     for task_id in config.task_ids:

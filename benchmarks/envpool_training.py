@@ -5,7 +5,6 @@ with the preset that `train_policy.py` uses for it, and prints the median ratio 
 Absolute numbers depend on the machine; the ratio is the result.
 """
 
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import run_entry_point
 from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
-from predictor.support.runtime import keep_freed_memory
+from predictor.support.runtime import keep_freed_memory, processor
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[
         "ratio": statistics.median(ratios),
         "ratios": ratios,
         "shares": shares,
-        "machine": platform.processor() or platform.machine(),
+        "machine": processor(),
     }
 
 

@@ -8,7 +8,7 @@ Without a GPU, `--project` times a step of the same shapes on this machine, coun
 computes the time on a card from them. That is arithmetic on assumptions, not a measurement.
 """
 
-import json
+import pickle
 import statistics
 import tempfile
 import time
@@ -30,7 +30,7 @@ from predictor.suite import SuiteConfig, line_config, line_folder, run_line
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out, write_json
 from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
 from predictor.support.runtime import processor, resolve_device, tune
@@ -115,6 +115,9 @@ class GpuSpringsConfig:
             raise UserError(f"share must lie between 0 and 1, got {self.share}")
         if self.project:
             return
+        for name in ("timed_steps", "batch_size", "peak_tflops", "bandwidth_gbs", "share", "kernel_us"):
+            if getattr(self, name) != getattr(type(self), name):
+                raise UserError(f"{name} is of a projection and has no effect without --project; leave it out")
         try:
             object.__setattr__(self, "device", resolve_device(self.device))
         except UserError as error:
@@ -149,9 +152,11 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
     before, result = _steps_done(folder / "run"), folder / "result.json"
     finished = result.exists()
     known = read_object(file) if finished and file.exists() else {}
-    if known and known["config"] == _plain(config):
+    if known and known.get("config") == _plain(config):
         return known
-    measured = json.loads(result.read_text()) if finished else run_line(config.suite, LINE)
+    measured = read_object(result) if finished else run_line(config.suite, LINE)
+    if finished and not {"train_seconds", "measure_seconds", "tests"} <= set(measured):
+        raise UserError(f"{result} is not the result of this line; delete it, and the line is measured again")
     steps = config.suite.sizes.steps
     minutes = measured["train_seconds"] / 60
     here = torch.cuda.get_device_name() if config.device.startswith("cuda") else processor()
@@ -179,7 +184,12 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
 
 def _steps_done(folder: Path) -> int:
     state = folder / "train_state.pt"
-    return int(torch.load(state, weights_only=True, map_location="cpu")["step"]) if state.exists() else 0
+    if not state.exists():
+        return 0
+    try:
+        return int(torch.load(state, weights_only=True, map_location="cpu")["step"])
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        raise UserError(f"{state} is damaged; delete {folder} to train anew") from error
 
 
 # --- The projection ---------------------------------------------------------------------------------------------------
@@ -375,6 +385,7 @@ def describe(content: dict[str, Any]) -> str:
 def main() -> None:
     """Runs the command."""
     config = parse(GpuSpringsConfig, __doc__)
+    check_out(config.out)
     if config.project:
         print(describe(project(config)))
         print(f"written to {config.out / 'projection.json'}")

@@ -138,6 +138,8 @@ def main() -> None:
     """Runs the command."""
     config = parse(JointConfig, __doc__)
     torch.set_num_threads(1)
+    for env_id in config.env_ids:  # raises before any is played
+        checkpoint_for(env_id)
     results = {env_id: measure(env_id, config) for env_id in config.env_ids}
     headings = ("env", "agents", "scenes", "single forecast [m]", "best of each", "joint best", "joint best, mixed")
     print(table(headings, [(env_id, *one.cells()) for env_id, found in results.items() for one in found]))

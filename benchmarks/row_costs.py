@@ -104,7 +104,9 @@ class RowCosts:
 
     def run(self) -> None:
         """Makes environments and a stream, and times their steps."""
-        clock = time.process_time if torch.get_num_threads() == 1 and not self._on_gpu else time.perf_counter
+        clock = self._gpu_clock if self._on_gpu else time.perf_counter
+        if torch.get_num_threads() == 1 and not self._on_gpu:
+            clock = time.process_time
         step, observe = make_run(self._simulator, self._rows, *self._rest)
         for _ in range(WARM_UP):
             step(), observe()
@@ -115,6 +117,12 @@ class RowCosts:
             between = clock()
             observe()
             self._times.append((between - began, clock() - between))
+
+    @staticmethod
+    def _gpu_clock() -> float:
+        """Returns the time at which all that was queued on the GPU is done [s]."""
+        torch.cuda.synchronize()
+        return time.perf_counter()
 
     def found(self, rise: int | None) -> dict[str, Any]:
         """Returns `Measured` as JSON values, from the rise of this process's memory [bytes]; of a GPU from its own."""

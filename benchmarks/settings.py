@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium as gym
+
+from envs.registry import checkpoint_for, envpool_task_of, make_env
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError
 from predictor.support.files import check_out_file
@@ -68,6 +71,21 @@ class Settings:
             raise UserError("section reference needs --reference PATH, a checkout of github.com/cgraber/cvpr_dNRI")
         if self.only and self.write_baseline is not None:
             raise UserError("a baseline holds every section; leave --only out")
+
+    def check_env(self) -> None:
+        """Checks that the environment can be timed, if a section does.
+
+        Raises:
+            UserError: an unknown environment, or one without a checkpoint, a copy in EnvPool or discrete actions.
+        """
+        if not {"wrappers", "ppo"} & set(self.sections):
+            return
+        checkpoint_for(self.env_id)
+        envpool_task_of(self.env_id)
+        env = make_env(self.env_id)
+        if not isinstance(env.action_space, gym.spaces.Discrete):
+            raise UserError(f"blocks are of discrete actions, {self.env_id} has {env.action_space}; time another")
+        env.close()
 
     def check_files(self) -> None:
         """Checks that the paths to write are no folders.

@@ -5,7 +5,6 @@ the median ratio. Absolute numbers depend on the machine; the ratio is the resul
 """
 
 import json
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -33,7 +32,7 @@ from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out_file, write_json
 from predictor.support.provenance import provenance
-from predictor.support.runtime import keep_freed_memory
+from predictor.support.runtime import keep_freed_memory, processor
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def main() -> None:
         "forecast_steps_per_s": steps / statistics.median(seconds["forecast"].tolist()),
         "overhead_median": statistics.median(ratios.tolist()) - 1,
         "overhead_quartiles": [q - 1 for q in quartiles(ratios)],
-        "machine": platform.processor() or platform.machine(),
+        "machine": processor(),
         "provenance": provenance(("torch", "gymnasium", "highway-env", "stable-baselines3")),
     }
     print(json.dumps(result, indent=2))

@@ -296,6 +296,19 @@ def test_ctrl_c_ends_the_blocks_that_run(tmp_path: Path, language: str):
     assert not after.exists()
 
 
+def test_a_block_that_exits_leaves_the_next_its_environment(tmp_path: Path):
+    text = '~~~bash\nexit 0\n~~~\n~~~bash\ntest -n "$PATH" && ls\n~~~\n~~~python\nimport os; os.environ["PATH"]\n~~~\n'
+    assert [result.error for result in results(tmp_path, text)] == ["", "", ""]
+
+
+def test_ctrl_c_while_a_page_is_copied_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    opened: list[Any] = []
+    monkeypatch.setattr(docs_check, "copy_tree", lambda _: opened[0].stop())
+    (tmp_path / "page.md").write_text("```bash\ntouch ran\n```\n")
+    blocks = docs_check.blocks_of(tmp_path / "page.md", tmp_path)
+    assert docs_check._run_page(blocks, 60.0, 1, opened) == []
+
+
 def test_a_page_of_another_folder_is_one_clear_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -313,6 +326,8 @@ def test_a_page_of_another_folder_is_one_clear_line(
         (["docs/nosuch.md"], "pages must be files, "),
         (["docs"], "pages must be files, "),
         (["README.md", "--jobs", "0"], "--jobs must be at least 1, got 0"),
+        (["README.md", "--limit-s", "-1"], "--limit-s must be positive, got -1"),
+        (["README.md", "--within", "nan"], "--within must be positive, got nan"),
     ],
 )
 def test_no_page_and_no_job_are_one_clear_line(

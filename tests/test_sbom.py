@@ -121,6 +121,13 @@ def test_a_broken_list_is_refused(line: str, tmp_path: Path):
         sbom.read_advisories(tmp_path / "list.csv")
 
 
+@pytest.mark.parametrize("text", ["", "name,id,cve,affected,source\npillow,CVE-1,,<1,here\n"])
+def test_a_list_of_other_columns_is_no_list_without_advisories(text: str, tmp_path: Path):
+    (tmp_path / "list.csv").write_text(text)
+    with pytest.raises(sbom.SbomError, match="list.csv:1: expected the columns package, id, cve, affected, source"):
+        sbom.read_advisories(tmp_path / "list.csv")
+
+
 def test_the_command_writes_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "argv", ["sbom.py", "--out", str(tmp_path / "new" / "sbom.json")])
     assert sbom.main() == 0

@@ -53,6 +53,8 @@ def test_the_table_says_what_the_named_keys_say():
     assert found == [[(True, False)] * 2, [(None, None)] * 2]
     with pytest.raises(UserError, match="crash_key is a key of the infos of an environment with one ego"):
         Task("simple_tag_v3", crash_key="crashed")
+    with pytest.raises(UserError, match="success_key must be a key of the infos, got ''; leave it out, or name one"):
+        Task(ENV_ID, success_key="")
 
 
 def test_an_episode_without_the_event_counts_where_others_report_it():

@@ -178,6 +178,7 @@ def test_matmul_rate_is_a_rate():
         ({"steps": -1}, "steps must not be negative, got -1"),
         ({"peak_tflops": -1.0}, "peak_tflops must not be negative, got -1.0"),
         ({"kernel_us": 0.0}, "kernel_us must be positive, got 0.0"),
+        ({"batch_size": 64}, "batch_size is of a projection and has no effect without --project"),
         ({"share": 1.5}, "share must lie between 0 and 1, got 1.5"),
         ({"device": "cuda"}, "torch finds no CUDA device; use --device cpu, or pass --project for an estimate"),
     ],
@@ -189,6 +190,35 @@ def test_bad_settings_are_named(
     with pytest.raises(UserError, match=message):
         replace(small, **changes)
     assert replace(small, device="cuda", project=True).suite.device == "cpu"
+
+
+def test_what_is_damaged_in_a_run_folder_is_named(small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(script, "make_missing", lambda _: {})
+    monkeypatch.setattr(script.SuiteConfig, "check_stores", lambda _: None)
+    monkeypatch.setattr(script, "run_line", lambda *_: pytest.fail("trained on"))
+    folder = small.out / "line"
+    monkeypatch.setattr(script, "line_folder", lambda *_: folder)
+    (folder / "run").mkdir(parents=True)
+    (folder / "run" / "train_state.pt").write_bytes(b"PK cut")
+    with pytest.raises(UserError, match=r"train_state.pt is damaged; delete .*run to train anew"):
+        script.run(small)
+    (folder / "run" / "train_state.pt").unlink()
+    (folder / "result.json").write_text("{}")
+    with pytest.raises(UserError, match=r"result.json is not the result of this line; delete it"):
+        script.run(small)
+    (folder / "result.json").write_text("")
+    with pytest.raises(UserError, match=r"result.json"):
+        script.run(small)
+
+
+def test_a_place_that_cannot_be_written_is_said_before_the_work(
+    small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch
+):
+    small.out.write_text("a file")
+    monkeypatch.setattr(script, "project", lambda _: pytest.fail("projected"))
+    monkeypatch.setattr(sys, "argv", ["gpu_springs", "--project", "--out", str(small.out)])
+    with pytest.raises(UserError, match=str(small.out)):
+        script.main()
 
 
 def test_without_a_card_one_line_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

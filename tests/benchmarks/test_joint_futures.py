@@ -1,6 +1,7 @@
 """The benchmark of joint futures: errors of known samples, and which agents count."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from benchmarks import joint_futures
 from benchmarks.envpool_parity import untouched_drivers
 from benchmarks.joint_futures import Errors, displacements_of, errors_of
 from predictor.evaluation.outcomes import Outcome
+from predictor.support.errors import UserError
 
 
 def test_errors_of_samples_that_belong_together():
@@ -61,6 +63,13 @@ def test_command_plays_the_deployed_wrapper(tmp_path: Path, capsys: pytest.Captu
     assert len(lines) == 2 and (one["agents"], two["agents"]) == (1, 2)
     assert one["joint"] == one["best"] == one["mixed"] <= one["single"]
     assert two["best"] <= two["joint"] <= two["single"]
+
+
+def test_an_unknown_id_is_said_before_another_is_played(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["joint_futures", "--env-ids", "merge-v1", "nonsense-v0"])
+    monkeypatch.setattr(joint_futures, "measure", lambda *_: pytest.fail("played"))
+    with pytest.raises(UserError, match="no checkpoint ships for env 'nonsense-v0'"):
+        joint_futures.main()
 
 
 @pytest.mark.slow

@@ -25,6 +25,22 @@ def test_bad_settings_are_one_clear_line(settings: dict[str, Any], message: str)
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("nonsense-v0", "no checkpoint ships for env 'nonsense-v0'"),
+        ("highway-mixed-v0", "EnvPool has no copy of 'highway-mixed-v0'"),
+        ("racetrack-v1", "blocks are of discrete actions, racetrack-v1 has Box"),
+    ],
+)
+def test_an_environment_that_cannot_be_timed_is_said_before_the_first_section(env_id: str, message: str):
+    settings = Settings(only=("machine", "wrappers"), env_id=env_id)
+    with pytest.raises(UserError, match=message):
+        settings.check_env()
+    Settings(only=("machine",), env_id=env_id).check_env()
+    Settings().check_env()
+
+
 def test_sections_run_in_their_order_and_the_reference_only_where_there_is_one():
     every = tuple(SECTIONS)
     assert Settings().sections == tuple(s for s in every if s != "reference")
