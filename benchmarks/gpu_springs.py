@@ -49,9 +49,8 @@ NO_KERNEL = {
 }  # fmt: skip
 """Operations that move no data; views are not counted either."""
 FLOP = {packet: flop_registry[packet] for packet in (ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm)} | {
-    ATEN.addmm_: flop_registry[ATEN.addmm],
-    ATEN.baddbmm_: flop_registry[ATEN.baddbmm],
-}
+    ATEN.addmm_: flop_registry[ATEN.addmm], ATEN.baddbmm_: flop_registry[ATEN.baddbmm],
+}  # fmt: skip
 """Functions that count the FLOP of matrix products, by operation; other operations count 0."""
 H200_TFLOPS = {"float32": 67.0, "tf32": 494.0, "bfloat16": 989.0}
 """Peak rate of an H200 for dense products [TFLOP/s], by precision, from the vendor's data sheet."""
@@ -115,9 +114,9 @@ class GpuSpringsConfig:
             raise UserError(f"share must lie between 0 and 1, got {self.share}")
         if self.project:
             return
-        for name in ("timed_steps", "batch_size", "peak_tflops", "bandwidth_gbs", "share", "kernel_us"):
-            if getattr(self, name) != getattr(type(self), name):
-                raise UserError(f"{name} is of a projection and has no effect without --project; leave it out")
+        projected = ("timed_steps", "batch_size", "peak_tflops", "bandwidth_gbs", "share", "kernel_us")
+        if idle := [name for name in projected if getattr(self, name) != getattr(type(self), name)]:
+            raise UserError(f"{idle[0]} is of a projection and has no effect without --project; leave it out")
         try:
             object.__setattr__(self, "device", resolve_device(self.device))
         except UserError as error:
@@ -151,8 +150,7 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
     folder, file = line_folder(config.suite, LINE), config.out / "summary.json"
     before, result = _steps_done(folder / "run"), folder / "result.json"
     finished = result.exists()
-    known = read_object(file) if finished and file.exists() else {}
-    if known and known.get("config") == _plain(config):
+    if (known := read_object(file) if finished and file.exists() else {}).get("config") == _plain(config):
         return known
     measured = read_object(result) if finished else run_line(config.suite, LINE)
     if finished and not {"train_seconds", "measure_seconds", "tests"} <= set(measured):
@@ -184,11 +182,9 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
 
 def _steps_done(folder: Path) -> int:
     state = folder / "train_state.pt"
-    if not state.exists():
-        return 0
     try:
-        return int(torch.load(state, weights_only=True, map_location="cpu")["step"])
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        return int(torch.load(state, weights_only=True, map_location="cpu")["step"]) if state.exists() else 0
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError, EOFError, pickle.UnpicklingError) as error:
         raise UserError(f"{state} is damaged; delete {folder} to train anew") from error
 
 
@@ -387,8 +383,7 @@ def main() -> None:
     config = parse(GpuSpringsConfig, __doc__)
     check_out(config.out)
     if config.project:
-        print(describe(project(config)))
-        print(f"written to {config.out / 'projection.json'}")
+        print(describe(project(config)), f"written to {config.out / 'projection.json'}", sep="\n")
         return
     summary = run(config)
     last, speed = summary["steps_of_the_last_call"], summary["steps_per_s_with_validation"]
@@ -396,9 +391,9 @@ def main() -> None:
     rate = "" if last is None else f" ({speed:.1f} steps/s, validation included) on {summary['device']}"
     print(
         f"{of_call} steps in {summary['train_minutes_of_the_last_call']:.1f} minutes{rate}; "
-        f"minADE {summary['min_ade_m']:.4f} m, graph accuracy {summary['graph_accuracy']:.3f}"
+        f"minADE {summary['min_ade_m']:.4f} m, graph accuracy {summary['graph_accuracy']:.3f}\n"
+        f"written to {config.out / 'summary.json'}"
     )
-    print(f"written to {config.out / 'summary.json'}")
 
 
 if __name__ == "__main__":
