@@ -36,6 +36,14 @@ def this_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_the_repository_cannot_be_imported_through_the_callers_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "hidden.py").write_text("")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RuntimeError, match="No module named 'hidden'"):
+        install_check.run([sys.executable, "-c", "import hidden"], tmp_path / "empty")
+
+
 def test_every_extra_is_tried():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (

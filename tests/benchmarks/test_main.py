@@ -133,6 +133,7 @@ def test_a_written_baseline_is_what_the_next_run_is_held_against(tmp_path: Path,
     [
         (("--only", "nothing"), "error: there is no section nothing; there are machine, "),
         (("--baseline", "no-such-file.json"), "error: no baseline at no-such-file.json; make one with python -m"),
+        (("--env-id", "nonsense-v0"), "error: no checkpoint ships for env 'nonsense-v0'"),
         (("--reference", "no-such-folder"), "error: --reference no-such-folder is no folder; it must be a checkout"),
     ],
 )

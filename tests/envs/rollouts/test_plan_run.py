@@ -103,6 +103,23 @@ def test_episodes_without_a_moment_are_an_error():
         measure_plans(run(max_steps=2))
 
 
+@pytest.mark.parametrize(("driver", "opened"), [("varied", "varied"), ("policy.zip", "idle")])
+def test_plans_are_looked_for_with_the_driver_that_was_asked_for(
+    driver: str, opened: str, monkeypatch: pytest.MonkeyPatch
+):
+    """An environment whose action space has no idle action is driven by what the user wrote for it."""
+
+    def refuse(env_id: str, driver: str, env_kwargs: str) -> None:
+        raise UserError(f"opened with {driver}")
+
+    monkeypatch.setattr(plan_run, "open_world", refuse)
+    with pytest.raises(UserError, match=f"opened with {opened}"):
+        measure_plans(replace(run(), driver=driver))
+    config = EvaluateConfig(("highway-fast-v0",), checkpoint=("constant-velocity",), driver=driver, plans=True)
+    with pytest.raises(UserError, match=f"opened with {opened}"):
+        evaluate_causes(config, Console(quiet=True))
+
+
 OWN = "tests.envs.own_plans:Planned-v0"
 
 
