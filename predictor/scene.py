@@ -20,7 +20,7 @@ from predictor.support.errors import UserError, short, some
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
 LARGEST = np.float64(1e30)
-"""Largest size of a state; single precision holds it, and differences of two. (As a float it were inf in float16.)"""
+"""Largest size of a state; float32 holds it, and differences of two (NumPy's: a float would be cast to float16)."""
 PADDING_ID = -1
 MOST_AGENTS = 65_536
 """Largest number of agents of a scene."""
