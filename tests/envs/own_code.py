@@ -67,6 +67,11 @@ def sees_nothing(env: gym.Env, rng: np.random.Generator) -> Callable[[], int]:
     return lambda: 1
 
 
+def adds_a_text(env: gym.Env, rng: np.random.Generator) -> Callable[[Any], int]:
+    """A driver with a bug that Python calls a TypeError, too."""
+    return lambda observation: 1 + "1"  # type: ignore[operator]
+
+
 def a_number(env: Any, rng: np.random.Generator) -> int:
     """No driver."""
     return 3

@@ -190,6 +190,7 @@ CODE = "own:tests.envs.own_code:"
         (NUMBER, f"driver '{NUMBER}' must give a function from observations to actions, got int"),
         (RAISES, f"highway-fast-v0, seed 0, step 1: driver '{RAISES}' failed: KeyError: 'goal'"),
         (f"{CODE}takes_nothing", r"is called as function\(env, rng\): takes_nothing\(\) takes 0 positional arguments"),
+        (f"{CODE}adds_a_text", f"driver '{CODE}adds_a_text' failed: TypeError: unsupported operand"),
         (f"{CODE}sees_nothing", "gives a function that is called with an observation: .* takes 0 positional arguments"),
         (f"{RAISES}_later", f"highway-fast-v0, seed 0, step 1: driver '{RAISES}_later' failed: KeyError: 'goal'"),
     ],
