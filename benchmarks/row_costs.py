@@ -104,9 +104,8 @@ class RowCosts:
 
     def run(self) -> None:
         """Makes environments and a stream, and times their steps."""
-        clock = self._gpu_clock if self._on_gpu else time.perf_counter
-        if torch.get_num_threads() == 1 and not self._on_gpu:
-            clock = time.process_time
+        cpu_clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+        clock = self._gpu_clock if self._on_gpu else cpu_clock
         step, observe = make_run(self._simulator, self._rows, *self._rest)
         for _ in range(WARM_UP):
             step(), observe()

@@ -290,7 +290,7 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
         if config.reactions or config.graph:
             check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
         if config.plans:
-            check_has_plans(env_id, config.env_kwargs, "idle" if driver.endswith(".zip") else driver)
+            check_has_plans(env_id, config.env_kwargs, driver)
     shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
     if config.reactions:
         for env_id in drivers:

@@ -97,10 +97,12 @@ class EnvPlans:
 def check_has_plans(env_id: str, env_kwargs: str = "", driver: str = "idle") -> None:
     """Checks that the ego of an environment has plans, and that these can be played and judged.
 
+    A trained policy (.zip) is not loaded for it: the environment is opened with an idle ego.
+
     Raises:
         UserError: it has none, the environment cannot be copied or reports no crashes, or it is unknown.
     """
-    world = open_world(env_id, driver, env_kwargs=env_kwargs)
+    world = open_world(env_id, "idle" if driver.endswith(".zip") else driver, env_kwargs=env_kwargs)
     try:
         if not world.spec.has_ego:
             raise UserError(f"plans are those of one ego, and {env_id} has several agents; use an env with one ego")
@@ -131,7 +133,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         UserError: the environment has no plan model, cannot be copied, checkpoints perceive differently, none fits, or
             no episode is long enough.
     """
-    check_has_plans(run.env_id, run.env_kwargs, "idle" if run.driver.endswith(".zip") else run.driver)
+    check_has_plans(run.env_id, run.env_kwargs, run.driver)
     world = run.open()
     spec = world.spec
     world.reset(run.seed)

@@ -24,6 +24,7 @@ from predictor.data.store_files import (
     ArrayWriter,
     StoreHeader,
     check_digest,
+    check_exists,
     check_new_store,
     digest_of,
     most_bytes_of,
@@ -37,7 +38,7 @@ from predictor.support.errors import UserError
 from predictor.support.files import check_place, new_folder, plain, told_of
 from predictor.support.locks import locked_path
 from predictor.support.reading import version_of
-from predictor.support.remote import address, exists, is_remote, local_copy
+from predictor.support.remote import address, is_remote, local_copy
 from predictor.support.typed_values import converted, from_table
 
 VERSION = 1
@@ -209,8 +210,7 @@ def read_store(path: Path) -> EpisodeStore:
     """
     path = Path(path)
     check_place(path)
-    if not exists(path):
-        raise UserError(f"no episode store at {address(path)}; make one with python -m envs.collect")
+    check_exists(path)
     if is_remote(path):
         with local_copy(path, most_bytes_of) as copy:
             return read_store(copy)

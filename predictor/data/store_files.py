@@ -109,6 +109,16 @@ class ArrayWriter:
         )
 
 
+def check_exists(path: Path) -> None:
+    """Checks that there is something at the path of a store.
+
+    Raises:
+        UserError: there is nothing.
+    """
+    if not exists(path):
+        raise UserError(f"no episode store at {short(address(path))}; make one with python -m envs.collect")
+
+
 def attributes_of(path: Path, format: str) -> dict[str, Any]:
     """Reads the attributes of a group, which must have the given value of "format".
 
@@ -118,10 +128,7 @@ def attributes_of(path: Path, format: str) -> dict[str, Any]:
     try:
         content = read_object(path / METADATA, MOST_METADATA_BYTES)
     except NoSuchFile as error:
-        if not exists(path):
-            raise UserError(
-                f"no episode store at {short(address(path))}; make one with python -m envs.collect"
-            ) from error
+        check_exists(path)
         raise UserError(f"{short(path)} is not an episode store (it has no {METADATA}); see docs/datasets") from error
     if content.get("zarr_format") != 3 or content.get("node_type") != "group":
         raise UserError(
