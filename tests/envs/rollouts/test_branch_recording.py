@@ -124,7 +124,8 @@ def test_labels_are_of_the_perturbed_agent_alone(branches: list[Episode]):
         shift_m = branch.causal_shift_m
         assert shift_m is not None
         known = ~np.isnan(shift_m)
-        assert known[step : step + 2, :, agent].any() and known.sum() == known[step : step + 2, :, agent].sum()
+        assert known[step, :, agent].any() and known[step + 1, :, agent].any()
+        assert known.sum() == known[step : step + 2, :, agent].sum()
         assert not known[:, 0].any() and not known[:, agent, agent].any()
 
 
@@ -208,7 +209,7 @@ def test_who_stands_does_not_brake(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("gives", [(True, False, False), (True, True, False)])
 def test_the_last_intervention_that_is_possible_is_kept(monkeypatch: pytest.MonkeyPatch, gives: tuple[bool, ...]):
-    """Also where none of them moves anybody, and later ones are not possible."""
+    """Also where none of them moves anybody but the one that is perturbed, and later ones are not possible."""
     world = open_world(ROAD, "idle")
     world.reset(5)
     played, found, possible = branch_recording._perturbed, [], iter(gives)
@@ -218,7 +219,8 @@ def test_the_last_intervention_that_is_possible_is_kept(monkeypatch: pytest.Monk
         return found[-1]
 
     monkeypatch.setattr(branch_recording, "_perturbed", perturbed)
-    monkeypatch.setattr(branch_recording, "farthest", lambda branches, *_: np.zeros(len(branches.ids)))
+    itself_m = lambda branches, *_: np.where(branches.ids == branches.intervention.agent, 9.0, 0.0)  # noqa: E731
+    monkeypatch.setattr(branch_recording, "farthest", itself_m)
     (branch,) = _branch(world, [world.full_scene()], ON_ROAD, np.random.default_rng(0))
     last = [one for one in found if one is not None][-1]
     assert len(found) == 3 and branch.ids[moment_of(branch)[1]] == last.intervention.agent

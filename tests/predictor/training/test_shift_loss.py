@@ -51,6 +51,11 @@ def test_it_is_zero_for_the_true_shift_alone(pairs: Pairs, modes: int):
     assert 0 < loss(pairs, 0.5 * true_m, modes) < loss(pairs, 0 * true_m, modes) < loss(pairs, -true_m, modes)
 
 
+def test_the_modes_mean_counts_beside_the_single_forecast(pairs: Pairs):
+    still_m = 0 * pairs.true_shift(2)
+    assert loss(pairs, still_m, 3) == pytest.approx(2 * loss(pairs, still_m), rel=1e-4)
+
+
 def test_a_large_error_counts_by_its_size(pairs: Pairs):
     """Every moved step is wrong by 30 m: each counts nearly in full, in the unit of the likelihood."""
     wrong_m = pairs.true_shift(2) + torch.where(pairs.true_shift(2).norm(dim=-1, keepdim=True) > 0, 300.0, 0.0)
