@@ -170,12 +170,11 @@ def _candidates(world: World, settings: CausalSettings) -> list[int]:
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1) if len(ids) > 1 else np.full(len(ids), np.inf)
     order = range(len(ids)) if world.spec.has_ego else np.argsort(nearest, kind="stable")
-    busy = interventions_of(world)
-    return [int(ids[i]) for i in order if nearest[i] <= settings.near_m and int(ids[i]) not in busy]
+    return [int(ids[i]) for i in order if nearest[i] <= settings.near_m]
 
 
 def possible(world: World, agent: int, steps: int) -> list[Intervention]:
-    """Returns what can be tried on an agent; empty for one that does not move by itself."""
+    """Returns what can be tried on an agent; empty for one that does not move by itself, or is under an intervention."""
     found = []
     for kind in TRIED:
         intervention = Intervention(agent, kind, steps)
