@@ -174,7 +174,7 @@ def _candidates(world: World, settings: CausalSettings) -> list[int]:
 
 
 def possible(world: World, agent: int, steps: int) -> list[Intervention]:
-    """Returns what can be tried on an agent; empty for one that does not move by itself, or is under an intervention."""
+    """Returns what can be tried on an agent: nothing if it does not move by itself or is under an intervention."""
     found = []
     for kind in TRIED:
         intervention = Intervention(agent, kind, steps)
