@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from highway_env.vehicle.objects import Obstacle
 
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.planner import (
@@ -121,6 +122,16 @@ def test_a_lane_change_beside_a_vehicle_is_risky_where_it_collides(behind_m: flo
     plan = planner.plan_model.names.index(action)
     assert planner.survival[plan, 0] == (0.0 if collides else 1.0)
     assert env.step(planner.plans.actions[plan])[4]["crashed"] == collides  # type: ignore[union-attr]
+
+
+def test_an_obstacle_ahead_is_avoided_though_no_forecast_has_it():
+    env = traffic(400.0, 40.0)
+    base: Any = env.unwrapped
+    base.road.objects.append(Obstacle(base.road, base.vehicle.position + [45.0, 0.0]))
+    planner = Planner(env, ConstantVelocity(ROAD))
+    planner()
+    assert planner.survival[planner.plan_model.names.index("IDLE"), -1] == 0.0
+    assert not drive(Planner(env, ConstantVelocity(ROAD)), env, 6)
 
 
 def test_an_empty_road_is_driven_fast():

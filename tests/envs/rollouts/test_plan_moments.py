@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from highway_env.vehicle.objects import Obstacle
 
 from envs.plans import plan_model_for
 from envs.rollouts import plan_moments
@@ -73,6 +74,15 @@ def test_the_planners_risk_has_its_margin_around_every_agent():
     left = plan_model_for(world.env).names.index("LANE_LEFT")
     assert usual.risk_of_planner[STRAIGHT][left] == 0.0 and wide.risk_of_planner[STRAIGHT][left] == 1.0
     np.testing.assert_array_equal(usual.risk[STRAIGHT], wide.risk[STRAIGHT])
+
+
+def test_a_plan_that_runs_into_an_obstacle_collides_and_is_risky():
+    world = slow_ahead()
+    simulator: Any = world.env.unwrapped
+    simulator.road.objects.append(Obstacle(simulator.road, simulator.vehicle.position + [60.0, -4.0]))
+    found = moment(world, plan_model_for(world.env), observed(world), 0, 0, HORIZON)
+    left = plan_model_for(world.env).names.index("LANE_LEFT")
+    assert found.crashed[1 + left] and found.risk[STRAIGHT][left] == 1.0
 
 
 def test_errors_are_those_of_the_others_where_nobody_collides():

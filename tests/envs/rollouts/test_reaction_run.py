@@ -88,6 +88,19 @@ def test_crashes_do_not_count_and_swerves_have_no_place_in_one_slope(monkeypatch
     assert (found.on_path["f"].pairs, found.on_path["f"].episodes) == (2, 2)
 
 
+def test_false_reactions_are_beside_those_that_do_not_crash(monkeypatch: pytest.MonkeyPatch):
+    def play(task: ReactionTask) -> list[Perturbation]:
+        moved_m = np.full((HORIZON, 2), [2.0, 0.0])
+        crash = Perturbation(NEAR_CELL.name, task.seed, 4, 1, 0, moved_m, {"f": 50 * moved_m}, True, False)
+        near = Perturbation(NEAR_CELL.name, task.seed, 5, 1, 0, moved_m, {"f": moved_m}, False, False)
+        still = Perturbation(STILL_CELL.name, task.seed, 6, 1, 0, 0 * moved_m, {"f": moved_m / 4}, False, False)
+        return [crash, near, still]
+
+    monkeypatch.setattr(reaction_run, "play_reactions", play)
+    found = measure_reactions(run(perturbations=3, episodes=9)).cells[1].false_reactions["f"]
+    assert found is not None and found.value == pytest.approx(0.25)
+
+
 def test_it_ends_when_there_are_enough(monkeypatch: pytest.MonkeyPatch):
     asked = given(monkeypatch, *(cell.name for cell in ELSEWHERE))
     found = measure_reactions(run(perturbations=3, episodes=100, workers=1))

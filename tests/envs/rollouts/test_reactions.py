@@ -221,6 +221,16 @@ def test_a_receiver_that_crashes_is_marked():
     assert one is not None and (one.receiver, one.sender, one.crashed) == (1, 2, True)
 
 
+def test_a_receiver_that_crashes_without_the_intervention_is_marked():
+    """Two that collide, unless one of them is taken out."""
+    world = road_world((0.0, 4.0), (14.0, 4.0), ego_m=(0.0, 12.0), speed_mps=25.0)
+    ahead: Any = world.env.unwrapped.road.vehicles[-1]  # type: ignore[union-attr]
+    ahead.speed = ahead.target_speed = 5.0
+    world.env._scene = world.reread()[0]  # type: ignore[union-attr]
+    one = moment(world, {}).perturbed(ON_LANES[-1], np.random.default_rng(0))
+    assert one is not None and {one.receiver, one.sender} == {1, 2} and one.crashed
+
+
 def branches_of(plain: Any, perturbed: Any) -> Branches:
     """One agent's branches, from its places."""
     both = []
