@@ -77,12 +77,15 @@ def test_the_planners_risk_has_its_margin_around_every_agent():
 
 
 def test_a_plan_that_runs_into_an_obstacle_collides_and_is_risky():
-    world = slow_ahead()
+    world = road_world((300.0, 0.0), ego_m=(0.0, 8.0), speed_mps=25.0)
     simulator: Any = world.env.unwrapped
-    simulator.road.objects.append(Obstacle(simulator.road, simulator.vehicle.position + [60.0, -4.0]))
-    found = moment(world, plan_model_for(world.env), observed(world), 0, 0, HORIZON)
-    left = plan_model_for(world.env).names.index("LANE_LEFT")
-    assert found.crashed[1 + left] and found.risk[STRAIGHT][left] == 1.0
+    simulator.road.objects.append(Obstacle(simulator.road, simulator.vehicle.position + [70.0, 0.0]))
+    world.step()
+    model = plan_model_for(world.env)
+    found = moment(world, model, observed(world), 0, 0, HORIZON)
+    outcome, risk = (dict(zip(model.names, of, strict=True)) for of in (found.crashed[1:], found.risk[STRAIGHT]))
+    assert outcome["IDLE"] and risk["IDLE"] == 1.0
+    assert not outcome["LANE_LEFT"] and risk["LANE_LEFT"] == 0.0
 
 
 def test_errors_are_those_of_the_others_where_nobody_collides():
