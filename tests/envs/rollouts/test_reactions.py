@@ -257,6 +257,22 @@ def test_who_only_drives_slower_or_faster_does_not_swerve(plain: Any, perturbed:
     assert reactions._swerved(branches_of(perturbed, plain), 7) is swerved
 
 
+def test_a_receiver_that_one_branch_loses_has_no_true_shift():
+    both = branches_of([(0, 0), (20, 0), (40, 0)], [(0, 0), (15, 0), (28, 0)])
+    shift_m = reactions._true_shift(both, 7)
+    assert shift_m is not None and shift_m.tolist() == [[-5, 0], [-12, 0]]
+    both.perturbed.valid[-1] = False
+    assert reactions._true_shift(both, 7) is None
+
+
+def test_what_is_asked_uses_up_no_noise_of_the_forecasters(monkeypatch: pytest.MonkeyPatch):
+    world, forecast, by = queue(), reactions._positions, list[Any]()
+    monkeypatch.setattr(reactions, "_positions", lambda forecaster: by.append(forecaster) or forecast(forecaster))
+    straight = SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)
+    assert moment(world, {"straight": straight}).perturbed(LEADER_CELL, np.random.default_rng(0)) is not None
+    assert len(by) == 2 and straight not in by
+
+
 def test_a_moment_without_a_pair_costs_no_branch(branches: list[tuple[Branch, Any]]):
     world = road_world((0.0, 4.0), ego_m=(0.0, 12.0))
     world.step()

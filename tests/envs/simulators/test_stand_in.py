@@ -6,7 +6,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from envs.rollouts.branches import copied
 from envs.rollouts.world import open_world
-from envs.simulators.stand_in import seat_driver
+from envs.simulators.stand_in import StandIn, seat_driver
 from tests.envs.interventions import played, road_world
 
 
@@ -68,3 +68,9 @@ def test_where_no_ego_has_a_place_nothing_changes():
     assert not seat_driver(several)
     assert [type(vehicle) for vehicle in several.unwrapped.road.vehicles] == kinds
     assert not seat_driver(open_world("simple_tag_v3", "heuristic").env)
+
+
+def test_its_constants_are_not_those_that_an_intersection_writes(monkeypatch: pytest.MonkeyPatch):
+    for name, value in (("DISTANCE_WANTED", 7.0), ("COMFORT_ACC_MAX", 6.0), ("COMFORT_ACC_MIN", -3.0)):
+        monkeypatch.setattr(IDMVehicle, name, value)
+    assert (StandIn.DISTANCE_WANTED, StandIn.COMFORT_ACC_MAX, StandIn.COMFORT_ACC_MIN) == (10.0, 3.0, -5.0)
