@@ -219,8 +219,11 @@ def test_the_last_intervention_that_is_possible_is_kept(monkeypatch: pytest.Monk
         return found[-1]
 
     monkeypatch.setattr(branch_recording, "_perturbed", perturbed)
-    itself_m = lambda branches, *_: np.where(branches.ids == branches.intervention.agent, 9.0, 0.0)  # noqa: E731
-    monkeypatch.setattr(branch_recording, "farthest", itself_m)
+
+    def itself_alone_m(branches: Branches, *_: Any) -> Any:
+        return np.where(branches.ids == branches.intervention.agent, 9.0, 0.0)
+
+    monkeypatch.setattr(branch_recording, "farthest", itself_alone_m)
     (branch,) = _branch(world, [world.full_scene()], ON_ROAD, np.random.default_rng(0))
     last = [one for one in found if one is not None][-1]
     assert len(found) == 3 and branch.ids[moment_of(branch)[1]] == last.intervention.agent

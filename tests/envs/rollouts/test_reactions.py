@@ -266,11 +266,16 @@ def test_a_receiver_that_one_branch_loses_has_no_true_shift():
 
 
 def test_what_is_asked_uses_up_no_noise_of_the_forecasters(monkeypatch: pytest.MonkeyPatch):
-    world, forecast, by = queue(), reactions._positions, list[Any]()
-    monkeypatch.setattr(reactions, "_positions", lambda forecaster: by.append(forecaster) or forecast(forecaster))
+    world, forecast, asked = queue(), reactions._positions, list[Any]()
+
+    def noting(forecaster: Any) -> Any:
+        asked.append(forecaster)
+        return forecast(forecaster)
+
+    monkeypatch.setattr(reactions, "_positions", noting)
     straight = SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)
     assert moment(world, {"straight": straight}).perturbed(LEADER_CELL, np.random.default_rng(0)) is not None
-    assert len(by) == 2 and straight not in by
+    assert len(asked) == 2 and straight not in asked
 
 
 def test_a_moment_without_a_pair_costs_no_branch(branches: list[tuple[Branch, Any]]):
