@@ -1,3 +1,5 @@
+from typing import Any
+
 import gymnasium as gym
 import highway_env  # noqa: F401
 import numpy as np
@@ -73,4 +75,20 @@ def test_where_no_ego_has_a_place_nothing_changes():
 def test_its_constants_are_not_those_that_an_intersection_writes(monkeypatch: pytest.MonkeyPatch):
     for name, value in (("DISTANCE_WANTED", 7.0), ("COMFORT_ACC_MAX", 6.0), ("COMFORT_ACC_MIN", -3.0)):
         monkeypatch.setattr(IDMVehicle, name, value)
-    assert (StandIn.DISTANCE_WANTED, StandIn.COMFORT_ACC_MAX, StandIn.COMFORT_ACC_MIN) == (10.0, 3.0, -5.0)
+    assert constants(StandIn) == (10.0, 3.0, -5.0)
+    world = road_world((15.0, 4.0), ego_m=(0.0, 4.0))
+    assert seat_driver(world.env) and constants(world.env.unwrapped.vehicle) == (10.0, 3.0, -5.0)
+
+
+def test_at_an_intersection_it_has_the_constants_of_the_traffic_there():
+    for env_id in ("intersection-v2", "intersection-mixed-v0"):
+        world = open_world(env_id, "idle")
+        world.reset(0)
+        assert seat_driver(world.env)
+        crossing = world.env.unwrapped
+        assert constants(crossing.vehicle) == (7.0, 6.0, -3.0)
+        assert env_id != "intersection-v2" or len({constants(driver) for driver in crossing.road.vehicles}) == 1
+
+
+def constants(driver: Any) -> tuple[float, float, float]:
+    return driver.DISTANCE_WANTED, driver.COMFORT_ACC_MAX, driver.COMFORT_ACC_MIN
