@@ -111,15 +111,21 @@ class _Remote(NamedTuple):
     packed: Packed
 
 
-_kept: dict[float, EpisodePool[bytes]] = {}
-"""The process that plays beside this process of Ray; it stays from task to task, with what it has imported."""
+_kept: dict[tuple[str, float], EpisodePool[bytes]] = {}
+"""The process that plays beside this process of Ray; it stays from task to task, with what it has imported.
+
+It plays one environment, as those here do: highway-env's intersection changes the drivers of its whole process.
+"""
 
 
 def _play_there(remote: _Remote) -> bytes | Failed:
     """Plays one episode in a process beside this one; in a task."""
-    if remote.timeout_s not in _kept:
-        _kept[remote.timeout_s] = EpisodePool(_unpacked, 1, remote.timeout_s, on_error="skip")
-    (result,) = _kept[remote.timeout_s].play([remote])
+    kind = (remote.env_id, remote.timeout_s)
+    if kind not in _kept:
+        for other in list(_kept):
+            _kept.pop(other).__exit__(None, None, None)
+        _kept[kind] = EpisodePool(_unpacked, 1, remote.timeout_s, on_error="skip")
+    (result,) = _kept[kind].play([remote])
     return result
 
 
