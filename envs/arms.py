@@ -210,7 +210,7 @@ class Arm:
             spaces: space of each entry of one scene.
 
         Raises:
-            UserError: the arm shows scenes of other episodes, and has none, or those of other sizes.
+            UserError: the arm shows scenes of other episodes, and has none, or those with other entries or sizes.
         """
         batch = len(entries["valid"])
         if self.shown.other_scene:
@@ -218,7 +218,14 @@ class Arm:
                 raise UserError(
                     f"arm '{self.name}' shows other episodes: pass bank=record_bank(...) of envs.entry_bank"
                 )
-            entries = {**entries, **self.bank.drawn_for(entries)}
+            present = {key: values for key, values in entries.items() if key in PRESENT_KEYS}
+            drawn = self.bank.drawn_for(present)
+            if lacking := [key for key in spaces if key in entries and key not in (*present, *drawn)]:
+                raise UserError(
+                    f"arm '{self.name}': the bank has no '{lacking[0]}', which is shown here; record the bank with "
+                    "this environment, this forecaster and the same options"
+                )
+            entries = {**present, **drawn}
         found = {}
         for key, space in spaces.items():
             full = np.zeros((batch, *(space.shape or ())), dtype=np.float32)

@@ -41,6 +41,10 @@ def everything(bank: EntryBank) -> dict[str, Any]:
     return observed("forecast", bank)
 
 
+HIDDEN = (
+    *("forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
+    *("what_if_gap", "what_if_contact", "what_if_risk"),
+)
 SHOWN = {
     "single": {"forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
     "no-edges": {"forecast", "closest", "mode_probs", "xy_scale"},
@@ -129,8 +133,10 @@ def test_shuffled_is_another_scene_and_the_same_in_every_run(bank: EntryBank, ev
         np.testing.assert_array_equal(found[key], again[key])
         assert not found[key][~present].any(), key
     assert (np.abs(found["forecast"][present] - everything["forecast"][present]) > 1.0).any(axis=(1, 2, 3)).all()
-    recorded = bank.entries["forecast"].reshape(-1, *found["forecast"].shape[1:])
-    assert all((recorded == one).all(axis=(1, 2, 3)).any() for one in found["forecast"][present])
+    for key in HIDDEN:
+        recorded = bank.entries[key].reshape(-1, *found[key].shape[1:])
+        recorded, shown = (values.reshape(len(values), -1) for values in (recorded, found[key][present]))
+        assert all((recorded == one).all(axis=1).any() for one in shown), key
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +217,13 @@ def test_an_unknown_arm_is_refused():
 def test_another_scene_needs_a_bank():
     with pytest.raises(UserError, match="record_bank"):
         ForecastObservation(make_env(FAST), "highway", arm=Arm("shuffled")).reset(seed=0)
+
+
+def test_a_bank_without_an_entry_is_refused(bank: EntryBank):
+    """The present scene's own was shown."""
+    less = EntryBank("less", {key: values for key, values in bank.entries.items() if not key.startswith("what_if")})
+    with pytest.raises(UserError, match=r"arm 'shuffled': the bank has no 'what_if_gap', .*; record the bank with"):
+        observed("shuffled", less)
 
 
 def test_a_bank_of_other_sizes_is_refused(bank: EntryBank):
