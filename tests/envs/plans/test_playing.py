@@ -53,6 +53,41 @@ def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
     env.close()
 
 
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", pytest.param("intersection-v2", marks=pytest.mark.slow)])
+def test_an_observation_shows_what_then_happens(env_id: str):
+    """Agents are told apart by where they are now; gaps follow the distances that the ego has in each plan."""
+    apart_m, gap_m = list[np.ndarray](), np.zeros(())
+    for plan in range(3):
+        env = ForecastObservation(make_env(env_id), what_if=True, arm=Arm("oracle-what-if"))
+        env.reset(seed=3)
+        shown, *_ = env.step(env.plans.actions[0])
+        plans, ego, heading, ego_id = env.plans, env.scene.states[0, :2], env.scene.heading_rad, int(env.scene.ids[0])
+        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        before = positions_m(env)
+        slots = np.flatnonzero(shown["valid"])
+        there = ego + shown["agents"][slots, :2] @ turn.T
+        ids = [min(before, key=lambda i, xy=xy: np.hypot(*(before[i] - xy))) for xy in there]
+        assert len(set(ids)) == len(ids) > 3
+        distances = [[np.hypot(*(before[i] - ego)) for i in ids]]
+        for step, action in enumerate((plans.actions[plan], *plans.later_actions[plan])):
+            ended = env.unwrapped.step(action)[2]
+            now = positions_m(env)
+            if ended or not set(ids) <= set(now):
+                break
+            if plan == 0:
+                expected = np.array([now[i] for i in ids])
+                np.testing.assert_allclose(ego + shown["forecast"][slots, step] @ turn.T, expected, atol=1e-3)
+            distances.append([np.hypot(*(now[i] - now[ego_id])) for i in ids])
+        assert len(distances) > 3
+        apart_m.append(np.min(distances, axis=0))
+        gap_m = shown["what_if_gap"][slots]
+        env.close()
+    apart, gap = np.transpose(apart_m), gap_m[:, :3]
+    assert (gap < apart - 1.9).all()  # vehicles are 2 m wide
+    of_plans = [values - values.mean(axis=1, keepdims=True) for values in (apart, gap)]
+    assert np.corrcoef(*(values.ravel() for values in of_plans))[0, 1] > 0.9
+
+
 @pytest.mark.slow
 def test_a_wrapper_that_counts_the_end_of_an_episode_lets_copies_go_on():
     """Stable-Baselines3's Monitor refuses steps after the end, and highway-env's copies are played past it."""
