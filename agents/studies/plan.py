@@ -35,7 +35,7 @@ MOST_BYTES = MIB
 REFERENCES = (PLANNER, CONSTANT_ACTIONS, "random", "idle")
 MULTIAGENT_REFERENCES = ("random", "idle")
 RIVALS = ("zeros", "constant-velocity")
-FLOOR, CEILING = "zeros", "oracle"
+FLOOR, CEILING, CEILING_OF_PLANS = "zeros", "oracle", "oracle-what-if"
 _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
 _OF_FORECASTS = ("perception_m", "what_if", "sizes_of", "num_samples", "horizon_steps")
@@ -127,7 +127,8 @@ class Study:
     floor: str = FLOOR
     """Arm whose policy is shown nothing of the future, from which headroom is counted."""
     ceiling: str = CEILING
-    """Arm whose policy is shown the true future, up to which headroom is counted."""
+    """Arm whose policy is shown the true future, up to which headroom is counted; left out of a file whose scenarios all
+    have candidate plans (`what_if`), the one that shows it in each plan."""
 
     def __post_init__(self) -> None:
         """Checks ranges and names."""
@@ -233,7 +234,8 @@ def read_study(path: Path) -> Study:
     given = {"name": path.stem, "scenarios": (), "arms": arms, "settings": settings}
     study = from_table(Study, content, where, given)
     scenarios = tuple(_scenario(name, table, study, f"{where}: scenarios.{name}") for name, table in tables.items())
-    return replace(study, scenarios=scenarios)
+    plans_alone = "ceiling" not in content and all(scenario.options.get("what_if") for scenario in scenarios)
+    return replace(study, scenarios=scenarios, ceiling=CEILING_OF_PLANS if plans_alone else study.ceiling)
 
 
 def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:

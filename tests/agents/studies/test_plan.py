@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from agents.studies.plan import StudyArm, read_study, shipped_studies, study_file, task_for
+from agents.studies.plan import SHIPPED, StudyArm, read_study, shipped_studies, study_file, task_for
 from agents.task import Observe
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
@@ -168,6 +168,24 @@ def test_headroom_has_floor_and_ceiling_alone(tmp_path: Path):
     text = study_text(floor='"ground"', ceiling='"forecast"')
     with pytest.raises(UserError, match="floor must be an arm of the study or one of .*, got 'ground'"):
         read_study(study_path(tmp_path, text)).headroom_only()
+
+
+@pytest.mark.parametrize(
+    ("name", "ceiling"), [("costly", "oracle-what-if"), ("predators", "oracle"), ("quick", "oracle")]
+)
+def test_where_policies_score_their_plans_the_ceiling_shows_the_future_in_each(name: str, ceiling: str):
+    """The entries of plans are zero in `oracle`."""
+    study = read_study(study_file(name)).headroom_only()
+    assert study.arm_names == ("zeros", ceiling)
+    for scenario in study.scenarios:
+        assert task_for(scenario, study.arms[1], name).what_if == (ceiling == "oracle-what-if")
+
+
+def test_a_ceiling_that_the_file_names_is_kept(tmp_path: Path):
+    text = (SHIPPED / "costly.toml").read_text()
+    path = tmp_path / "named.toml"
+    path.write_text('ceiling = "oracle"\n' + text)
+    assert read_study(path).ceiling == "oracle"
 
 
 def test_arms_are_those_of_the_task():
