@@ -127,8 +127,8 @@ class Study:
     floor: str = FLOOR
     """Arm whose policy is shown nothing of the future, from which headroom is counted."""
     ceiling: str = CEILING
-    """Arm whose policy is shown the true future, up to which headroom is counted; left out of a file whose scenarios all
-    have candidate plans (`what_if`), the one that shows it in each plan."""
+    """Arm whose policy is shown the true future, up to which headroom is counted. A file that names none, and whose
+    scenarios all have candidate plans (`what_if`), has the arm that shows it in each plan."""
 
     def __post_init__(self) -> None:
         """Checks ranges and names."""
