@@ -28,6 +28,11 @@ FEW = {
 """Ids with one or two others, who stay far away or on one side: more of the squashed distances are near 1 or -1."""
 LARGEST = {"roundabout-v1": 25}
 """Bound of the largest input where it is not 10: edge features have no scale, and those of this checkpoint reach 20."""
+WITH_PLANS = (
+    *("highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2"),
+    *("highway-mixed-costly-v0", "intersection-costly-v0"),
+)
+"""Ids of the studies of policies that score their plans."""
 LONG = {"racetrack-large-v1": 60}
 """Steps of an episode, where the ego begins alone."""
 
@@ -59,24 +64,41 @@ def seen_by(task: Task, steps: int = 12) -> tuple[Any, dict[str, torch.Tensor]]:
     return space, {key: torch.from_numpy(np.stack([one[key] for one in same])) for key in space}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", [*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS])
-def test_no_entry_is_constant_or_only_saturated(env_id: str):
-    task = Task(env_id)
-    space, observations = seen_by(task, LONG.get(env_id, 12))
-    config = AttentionConfig.for_scenes(task.scene_spec)
-    extractor = ForecastAttention(space, config)
+def read_by(task: Task, steps: int = 12) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Returns entries of present agents by key, and what the extractor makes of them, (agents, inputs)."""
+    space, observations = seen_by(task, steps)
+    extractor = ForecastAttention(space, AttentionConfig.for_scenes(task.scene_spec))
     env, slot = (observations["valid"] > 0.5).nonzero(as_tuple=True)
     present = {key: observations[key][env, slot] for key in extractor._keys}
-    for key, values in present.items():
-        assert values.flatten(1).std(0).max() > 0.01 or (key == "edge_probs" and env_id in ONE_GRAPH), key
-    present[EGO_PATH] = observations[EGO_PATH][env]
-    inputs = extractor._token_inputs(present)
+    return present, extractor._token_inputs(present | {EGO_PATH: observations[EGO_PATH][env]})
+
+
+def check_inputs(inputs: torch.Tensor, env_id: str) -> None:
+    """Checks that few inputs are saturated, and few at rest."""
     saturated = ((inputs.abs() > 0.99) & (inputs.abs() <= 1.0)).float().mean(0)
     assert inputs.abs().max() < LARGEST.get(env_id, 10)
     most_saturated, least_moving = (0.25, 0.85) if env_id in FEW else (0.1, 0.9)
     assert (saturated > 0.9).float().mean() < most_saturated
     assert (inputs.std(0) > 1e-3).float().mean() > least_moving
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", [*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS])
+def test_no_entry_is_constant_or_only_saturated(env_id: str):
+    present, inputs = read_by(Task(env_id), LONG.get(env_id, 12))
+    for key, values in present.items():
+        assert values.flatten(1).std(0).max() > 0.01 or (key == "edge_probs" and env_id in ONE_GRAPH), key
+    check_inputs(inputs, env_id)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", WITH_PLANS)
+def test_with_futures_and_plans_every_number_of_an_entry_moves(env_id: str):
+    present, inputs = read_by(Task(env_id, num_samples=6, what_if=True))
+    assert {"mode_probs", "xy_scale", "what_if_gap", "what_if_contact", "what_if_risk"} <= set(present)
+    for key, values in present.items():
+        assert values.flatten(1).std(0).min() > 0.005, key
+    check_inputs(inputs, env_id)
 
 
 @pytest.mark.slow
