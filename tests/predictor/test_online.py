@@ -36,17 +36,24 @@ def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> 
     torch.testing.assert_close(ours.edge_features, expected.edge_features, rtol=0, atol=tolerance)
     # a free run through untrained weights amplifies what is left: 1 % of a position, where edges agree to `tolerance`
     torch.testing.assert_close(ours.xy, expected.xy, rtol=1e-5 if tolerance < 1e-4 else 1e-2, atol=10 * tolerance)
+    assert (ours.mode_probs is None) == (expected.mode_probs is None)
+    if ours.mode_probs is not None and expected.mode_probs is not None:
+        torch.testing.assert_close(ours.mode_probs, expected.mode_probs, rtol=0, atol=tolerance)
 
 
 def envs_of(forecast: Forecast, envs: Sequence[int]) -> Forecast:
     chosen = list(envs)
     return Forecast(
-        forecast.xy[chosen], forecast.edge_probs[chosen], forecast.edge_features[chosen], forecast.valid[chosen]
+        forecast.xy[chosen],
+        forecast.edge_probs[chosen],
+        forecast.edge_features[chosen],
+        forecast.valid[chosen],
+        None if forecast.mode_probs is None else forecast.mode_probs[chosen],
     )
 
 
-def reference(forecaster: DGVAE, history: History) -> Forecast:
-    """The forecast after an episode's scenes, from one pass over all of them."""
+def reference(forecaster: DGVAE, history: History, num_samples: int = 1) -> Forecast:
+    """The forecast after an episode's scenes, from one pass over all of them; several samples are modes."""
     column: dict[tuple[int, int], int] = {}  # (id, step at which this stay began) → column; the ego's is the first
     began: dict[int, int] = {}
     places: list[list[int]] = []
@@ -63,17 +70,23 @@ def reference(forecaster: DGVAE, history: History) -> Forecast:
     tensor, present_ = torch.from_numpy(states.astype(np.float32)), torch.from_numpy(valid)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
-        window = forecaster.window(tensor, present_, torch.tensor([len(history) - 1]), forecaster.horizon_steps)
+        last_observed = torch.tensor([len(history) - 1])
+        window = forecaster.window(tensor, present_, last_observed, forecaster.horizon_steps, num_modes=num_samples)
+    modes = window.modes or Futures(window.rollout[:, None])
     last, place = history[-1], places[-1]
-    xy = torch.zeros(1, 1, AGENTS, forecaster.horizon_steps, 2)
+    xy = torch.zeros(1, num_samples, AGENTS, forecaster.horizon_steps, 2)
     probs = torch.zeros(1, AGENTS, AGENTS, forecaster.num_edge_types)
     probs[..., 0] = 1.0
     features = torch.zeros(1, AGENTS, AGENTS, forecaster.edge_feature_dim)
     places = np.flatnonzero(last.valid)
-    xy[0, 0, places] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2]
+    xy[0, :, places] = modes.states[0][:, place, :, :2] - tensor[0, -1, 0, :2]
+    shares = None
+    if modes.mode_probs is not None:
+        shares = torch.zeros(1, num_samples, AGENTS)
+        shares[0, :, places] = modes.mode_probs[0][:, place]
     probs[0, places[:, None], places] = window.prior_logits[0, -1][place][:, place].softmax(-1)
     features[0, places[:, None], places] = window.features[0, -1][place][:, place]
-    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None])
+    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None], shares)
 
 
 @st.composite
@@ -91,8 +104,9 @@ some_envs = st.lists(st.sampled_from(range(ENVS)), unique=True, min_size=1).map(
 class Streams(RuleBasedStateMachine):
     """Everything that can happen to the parallel environments, in any order."""
 
-    size: Literal["fast", "rich"] = "fast"
+    size: Literal["fast", "rich", "plural"] = "fast"
     tolerance = 1e-5
+    num_samples = 1
 
     @initialize(first=st.tuples(*[scenes()] * ENVS))
     def begin(self, first: tuple[Scene, ...]) -> None:
@@ -133,10 +147,10 @@ class Streams(RuleBasedStateMachine):
 
     @invariant()
     def forecast_is_that_of_the_whole_history(self) -> None:
-        ours = self.online.forecast()
+        ours = self.online.forecast(num_samples=self.num_samples)
         assert len(ours.xy) == len(self.judged)
         for env, history in enumerate(self.judged):
-            assert_same(envs_of(ours, [env]), reference(self.model, history), self.tolerance)
+            assert_same(envs_of(ours, [env]), reference(self.model, history, self.num_samples), self.tolerance)
 
 
 class RichStreams(Streams):
@@ -146,10 +160,19 @@ class RichStreams(Streams):
     tolerance = 1e-4  # corrections amplify rounding
 
 
+class PluralStreams(Streams):
+    """The same with modes: each of them, and their probabilities, are those of the whole history."""
+
+    size = "plural"
+    num_samples = 3
+
+
 TestStreams = Streams.TestCase
 TestStreams.settings = settings(max_examples=10, stateful_step_count=8)
 TestRichStreams = RichStreams.TestCase
 TestRichStreams.settings = settings(max_examples=4, stateful_step_count=6)
+TestPluralStreams = PluralStreams.TestCase
+TestPluralStreams.settings = settings(max_examples=6, stateful_step_count=6)
 
 
 # --- The same, one fact at a time -------------------------------------------------------------------------------------
