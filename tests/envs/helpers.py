@@ -228,7 +228,9 @@ class NamedReader:
         return Scene(states, ids, valid)
 
 
-def agent_entries(scene: MultiagentScene, forecast: Forecast, view: SceneSpec) -> AgentEntries:
+def agent_entries(
+    scene: MultiagentScene, forecast: Forecast, view: SceneSpec, uncertainty: bool = False
+) -> AgentEntries:
     """Returns each agent's forecast entries of one scene."""
-    [entries] = view_entries([scene], forecast, view)
+    [entries] = view_entries([scene], forecast, view, uncertainty)
     return entries

@@ -19,7 +19,7 @@ import pytest
 import torch
 from pettingzoo import ParallelEnv
 
-from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries, path_entries
+from envs.entries import FORECAST_KEYS, PATH_KEYS, UNCERTAINTY_KEYS, ego_entries, path_entries
 from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastStream
 from envs.parallel import ForecastParallelEnv
@@ -40,6 +40,8 @@ from tests.envs.helpers import HORIZON, SIZES, agent_entries
 Views = dict[str, dict[str, Any]]
 Bodies = list[tuple[Hashable, tuple[float, ...]]]
 EGO = "ego"
+MODES = 3
+"""Number of futures of each agent, all of which a view holds."""
 _serials = itertools.count()
 
 
@@ -407,8 +409,9 @@ class Moment:
 
 
 def tiny(spec: SceneSpec) -> DGVAE:
-    """Random weights for any number of features, large enough that the history has a say."""
-    config = replace(SIZES, delta_scales=tuple(0.1 * scale for scale in spec.feature_scales))
+    """Random weights for any number of features, with modes, large enough that the history has a say."""
+    scales = tuple(0.1 * scale for scale in spec.feature_scales)
+    config = replace(SIZES, delta_scales=scales, num_modes=MODES, rollout_graph="frozen")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = DGVAE(spec, config, HORIZON)
@@ -437,7 +440,7 @@ class Session:
             spec = (multiagent_reader_for(bare) if maker is None else maker(bare)).spec
             self.model = tiny(spec)
             self.env = ForecastParallelEnv(
-                bare, forecaster=self.model, reader=maker, perception_m=sight_m, max_agents=size
+                bare, forecaster=self.model, reader=maker, perception_m=sight_m, max_agents=size, num_samples=MODES
             )
         else:
             size = SIZE if size is None else size
@@ -445,7 +448,9 @@ class Session:
             spec = (reader_for(bare, sight_m, size) if maker is None else maker(bare)).spec
             self.model = tiny(spec)
             save_checkpoint(folder, self.model, CheckpointInfo(spec, self.model.config, HORIZON))
-            self.env = ForecastObservation(bare, str(folder), reader=maker, perception_m=sight_m, max_agents=size)
+            self.env = ForecastObservation(
+                bare, str(folder), reader=maker, perception_m=sight_m, max_agents=size, num_samples=MODES
+            )
         self.spec = spec
         self.view = replace(spec, perception_m=sight_m, max_agents=spec.max_agents if size is None else size)
 
@@ -474,9 +479,9 @@ class Session:
         multi = moments[-1].multi
         forecast = full_window(self.model, [moment.multi.scene for moment in moments])
         if self.subject.multiagent:
-            return agent_entries(multi, forecast, self.view)
+            return agent_entries(multi, forecast, self.view, uncertainty=True)
         scenes = SceneBatch.stack([multi.scene])
-        entries = ego_entries(scenes, forecast)
+        entries = ego_entries(scenes, forecast, uncertainty=True)
         entries |= path_entries(scenes, entries["forecast"], self.model.spec.dt_s)
         return {EGO: {key: value[0] for key, value in entries.items()}}
 
@@ -494,7 +499,7 @@ class Session:
         if not self.subject.multiagent:
             scene, seen = MultiagentScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
         views = {name: {key: view[key] for key in view if key != "observation"} for name, view in seen.items()}
-        assert all(set(view) == {*FORECAST_KEYS, *PATH_KEYS} for view in views.values())
+        assert all(set(view) == {*FORECAST_KEYS, *PATH_KEYS, *UNCERTAINTY_KEYS} for view in views.values())
         return Moment(scene, views, self.env.forecast, self.subject.bodies(self.env))
 
 
@@ -503,7 +508,7 @@ class Stream:
 
     def __init__(self, session: Session) -> None:
         self._multiagent, view = session.subject.multiagent, session.view
-        config = ForecastConfig()
+        config = ForecastConfig(num_samples=MODES)
         self._stream: Any = (
             MultiagentStream(session.model, session.spec, config, view.perception_m, view.max_agents)
             if self._multiagent
@@ -548,14 +553,18 @@ def full_window(model: DGVAE, scenes: Sequence[Scene]) -> Forecast:
     tensor, present_ = torch.from_numpy(states.astype(np.float32)), torch.from_numpy(valid)
     with torch.inference_mode(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
-        window = model.window(tensor, present_, torch.tensor([len(scenes) - 1]), HORIZON)
+        window = model.window(tensor, present_, torch.tensor([len(scenes) - 1]), HORIZON, num_modes=MODES)
     last, place = scenes[-1], places[-1]
     known, count = np.flatnonzero(last.valid), len(last.valid)
+    modes = window.modes
     assert window.prior_logits is not None and window.features is not None
-    xy = torch.zeros(1, 1, count, HORIZON, 2)
+    assert modes is not None and modes.mode_probs is not None and modes.scale is not None
+    xy, scale = torch.zeros(1, MODES, count, HORIZON, 2), torch.zeros(1, MODES, count, HORIZON, 2)
+    shares = torch.zeros(1, MODES, count)
     probs = torch.zeros(1, count, count, model.num_edge_types)
     features = torch.zeros(1, count, count, model.edge_feature_dim)
-    xy[0, 0, known] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2] * model.spec.has_ego
+    xy[0, :, known] = modes.states[0][:, place, :, :2] - tensor[0, -1, 0, :2] * model.spec.has_ego
+    scale[0, :, known], shares[0, :, known] = modes.scale[0][:, place], modes.mode_probs[0][:, place]
     probs[0, known[:, None], known] = window.prior_logits[0, -1][place][:, place].softmax(-1)
     features[0, known[:, None], known] = window.features[0, -1][place][:, place]
-    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None])
+    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None], mode_probs=shares, xy_scale=scale)

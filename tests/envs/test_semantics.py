@@ -16,7 +16,7 @@ from envs.readers.mpe import MPE_FEATURES
 from envs.readers.pursuit import PURSUIT_FEATURES
 from predictor.scene import KINEMATIC_FEATURES, Scene
 from tests.envs.helpers import assert_same, largest_difference
-from tests.envs.semantics import EGO, SUBJECTS, Bodies, Moment, Session, Views, named
+from tests.envs.semantics import EGO, MODES, SUBJECTS, Bodies, Moment, Session, Views, named
 
 TURN = 3
 """The step from which on an alternative future differs."""
@@ -279,7 +279,10 @@ def test_views_turn_with_the_viewer_and_start_from_it(name: str, take: Callable[
     """Turned back and moved back, what a viewer sees are the scene's positions and the world's forecasts."""
     session, compared = take(name).session, 0
     for moment in take(name).episodes[0][::2]:
-        scene, xy = moment.multi.scene, moment.forecast.xy[0, 0].numpy()
+        scene, shares = moment.multi.scene, moment.forecast.mode_probs
+        assert shares is not None
+        order = np.argsort(-shares[0].numpy(), axis=0, kind="stable")  # (samples, agents)
+        xy = np.take_along_axis(moment.forecast.xy[0].numpy(), order[..., None, None], axis=0)
         for viewer, view in moment.views.items():
             index = moment.multi.index_of[viewer]
             heading_rad, own = moment.multi.heading_rad[index], scene.states[index]
@@ -289,7 +292,9 @@ def test_views_turn_with_the_viewer_and_start_from_it(name: str, take: Callable[
             for k in np.flatnonzero(view["valid"]):
                 seen = np.r_[view["agents"][k, :2] @ back, view["agents"][k, 2:4] @ back] + own[:4]
                 future = view["forecast"][k] @ back + origin
-                misses = np.abs(scene.states[:, :4] - seen).max(axis=1) + np.abs(xy - future).max(axis=(1, 2))
+                misses = np.abs(scene.states[:, :4] - seen).max(axis=1) + np.abs(xy - future[:, None]).max(
+                    axis=(0, 2, 3)
+                )
                 assert misses[scene.valid].min() < 1e-2
                 compared += 1
     assert compared > 5
@@ -330,7 +335,9 @@ def test_views_hold_nothing_but_features_and_forecasts(name: str, take: Callable
         for view in moment.views.values():
             assert {key: value.shape for key, value in view.items()} == {
                 "agents": (others, session.spec.num_features),
-                "forecast": (others, model.horizon_steps, 2),
+                "forecast": (others, MODES, model.horizon_steps, 2),
+                "mode_probs": (others, MODES),
+                "xy_scale": (others, MODES, model.horizon_steps, 2),
                 "edge_probs": (others, 2 * (model.num_edge_types - 1)),
                 "edge_features": (others, 2 * model.edge_feature_dim),
                 "valid": (others,),
