@@ -48,7 +48,7 @@ def envs_of(forecast: Forecast, envs: Sequence[int]) -> Forecast:
         forecast.edge_probs[chosen],
         forecast.edge_features[chosen],
         forecast.valid[chosen],
-        None if forecast.mode_probs is None else forecast.mode_probs[chosen],
+        mode_probs=None if forecast.mode_probs is None else forecast.mode_probs[chosen],
     )
 
 
@@ -86,7 +86,7 @@ def reference(forecaster: DGVAE, history: History, num_samples: int = 1) -> Fore
         shares[0, :, places] = modes.mode_probs[0][:, place]
     probs[0, places[:, None], places] = window.prior_logits[0, -1][place][:, place].softmax(-1)
     features[0, places[:, None], places] = window.features[0, -1][place][:, place]
-    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None], shares)
+    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None], mode_probs=shares)
 
 
 @st.composite
