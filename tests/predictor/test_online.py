@@ -82,7 +82,7 @@ def reference(forecaster: DGVAE, history: History, num_samples: int = 1) -> Fore
     xy[0, :, places] = modes.states[0][:, place, :, :2] - tensor[0, -1, 0, :2]
     shares = None
     if modes.mode_probs is not None:
-        shares = torch.zeros(1, num_samples, AGENTS)
+        shares = torch.full((1, num_samples, AGENTS), 1 / num_samples)
         shares[0, :, places] = modes.mode_probs[0][:, place]
     probs[0, places[:, None], places] = window.prior_logits[0, -1][place][:, place].softmax(-1)
     features[0, places[:, None], places] = window.features[0, -1][place][:, place]
