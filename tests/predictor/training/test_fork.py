@@ -54,7 +54,7 @@ def forecast(store: Path, modes: int) -> tuple[Futures, Tensor, Tensor]:
         input_changes=False,
         fit_inputs=False,
         edge_geometry=False,
-        steps=450 if modes else 250,
+        steps=450,
         batch_size=32,
         lr=4e-3,
         history_steps=BEFORE,
