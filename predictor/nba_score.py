@@ -1,9 +1,9 @@
 """NBA "Score", SocialVAE's protocol: `python -m predictor.nba_score --data data/nba_score/test --checkpoint NAME`.
 
-Measures checkpoints, constant velocity, and constant velocity with noise (fitted to `--train-data`) on every window of
-the test store: 8 observed frames of 0.12 s, 12 predicted ones, best of K = 20 for each player, in feet. Prints a table
-beside the published figures; writes JSON and Markdown. `predictor.evaluation.nba_protocol` defines the protocol,
-docs/datasets/nba.md has the commands that make the stores and train a model.
+Measures checkpoints and constant velocity, each also with Gaussian noise that is fitted to `--train-data`, on every
+window of the test store: 8 observed frames of 0.12 s, 12 predicted ones, best of K = 20 for each player, in feet.
+Prints a table beside the published figures; writes JSON and Markdown. `predictor.evaluation.nba_protocol` defines the
+protocol, docs/datasets/nba.md has the commands that make the stores and train a model.
 """
 
 import time
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import load_checkpoint, name_of_folder
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
@@ -29,6 +29,7 @@ from predictor.evaluation.nba_protocol import (
     PlayerTally,
     drawn,
     fitted_noise,
+    fitted_residual,
     player_outcomes,
     protocol_windows,
 )
@@ -70,7 +71,8 @@ class NbaScoreConfig:
     checkpoint: tuple[str, ...] = ()
     """Checkpoints to measure: shipped names, folders, run folders."""
     train_data: Path | None = None
-    """Episode store to which the noise around constant velocity is fitted; None leaves that row out."""
+    """Episode store to which the noise around constant velocity, and around the single forecast of each checkpoint, is
+    fitted; None leaves these rows out."""
     out: Path | None = None
     """Folder for nba_score.json and nba_score.md; none are written if left out."""
     num_samples: int = NUM_SAMPLES
@@ -94,14 +96,14 @@ class NbaScoreConfig:
         check_at_least(self, 0, "max_windows", "seed")
         if self.train_data is not None and self.num_samples == 1:
             raise UserError(
-                "--train-data needs --num-samples of at least 2: sample 0 of constant velocity with noise has none; "
-                "leave --train-data out"
+                "--train-data needs --num-samples of at least 2: sample 0 of a forecast with noise has none; leave "
+                "--train-data out"
             )
         object.__setattr__(self, "device", resolve_device(self.device))
 
 
 def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
-    """Returns the errors of constant velocity, of constant velocity with noise, and of each checkpoint.
+    """Returns the errors of constant velocity and of each checkpoint, each also with noise around its single forecast.
 
     Raises:
         UserError: `out` is a file, a store or checkpoint is unreadable, or their specs differ.
@@ -114,16 +116,18 @@ def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
         info.spec.check_recorded(windows.spec, f"checkpoint '{name}'", f"store {config.data}")
     straight = ConstantVelocity(windows.spec, nba_protocol.HORIZON_STEPS)
     lines = [_measured("constant velocity", straight, windows, config, 1)]
+    training = None
     if config.train_data is not None:
-        lines.append(_measured("constant velocity + noise", _noise(config.train_data, config), windows, config))
+        training = protocol_windows(read_store(config.train_data), config.train_data)
+        noise = fitted_noise(training, drawn(training, config.max_windows, config.seed))
+        lines.append(_measured("constant velocity + noise", noise, windows, config))
     for name, (model, _) in zip(config.checkpoint, models, strict=True):
-        lines.append(_measured(name_of_folder(name), model, windows, config))
+        label = name_of_folder(name)
+        if training is not None:
+            noisy = fitted_residual(model, training, config.seed, config.device)
+            lines.append(_measured(f"{label}, single forecast + Gaussian", noisy, windows, config))
+        lines.append(_measured(label, model, windows, config))
     return lines
-
-
-def _noise(path: Path, config: NbaScoreConfig) -> NoisyConstantVelocity:
-    windows = protocol_windows(read_store(path), path)
-    return fitted_noise(windows, drawn(windows, config.max_windows, config.seed))
 
 
 def _measured(

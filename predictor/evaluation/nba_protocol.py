@@ -21,6 +21,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.baselines.gaussian_residual import GaussianResidual
 from predictor.data.nba import DT_S, FEATURES, METRES_PER_FOOT
 from predictor.data.store import EpisodeStore
 from predictor.data.windows import Windows
@@ -60,6 +61,10 @@ PUBLISHED = (
     Published("SocialVAE + FPC, published", 0.58, 0.95),
 )
 """SocialVAE's figures, quoted from memory. FPC draws 15 to 19 times as many samples and keeps 20 that are far apart."""
+
+
+RESIDUAL_WINDOWS = 2_000
+"""Largest number of training windows, of ten players each, to which a model's covariance is fitted."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +147,21 @@ def fitted_noise(windows: Windows, indices: Int[np.ndarray, " some"]) -> NoisyCo
     straight = ConstantVelocity(windows.spec, HORIZON_STEPS)
     outcomes = player_outcomes(straight, windows, indices, 1, batch_size=1024, label="fit noise")
     return NoisyConstantVelocity.fit(windows.spec, fitted_std_m(outcome for _, outcome in outcomes))
+
+
+def fitted_residual(forecaster: Forecaster, windows: Windows, seed: int = 0, device: str = "cpu") -> GaussianResidual:
+    """Returns a forecaster's single forecast with noise, whose covariance is fitted to errors on players.
+
+    Args:
+        forecaster: model whose single forecast errs.
+        windows: training data, of which at most `RESIDUAL_WINDOWS` are drawn evenly.
+        seed: random seed of the drawn windows.
+        device: device that runs the model.
+    """
+    indices = drawn(windows, RESIDUAL_WINDOWS, seed)
+    outcomes = player_outcomes(forecaster, windows, indices, 1, seed, device=device, label="fit covariance")
+    errors = [(o.future - o.forecast[:, 0])[o.valid.all(-1)].cpu().numpy() for _, o in outcomes]
+    return GaussianResidual.fit(forecaster, np.concatenate(errors))
 
 
 class PlayerTally:

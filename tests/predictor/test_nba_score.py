@@ -63,8 +63,11 @@ def test_table_and_files(
     assert [(row["name"], row["num_samples"], row["forecasts"]) for row in rows] == [
         ("constant velocity", 1, 120),
         ("constant velocity + noise", 20, 120),
+        ("run, single forecast + Gaussian", 20, 120),
         ("run", 20, 120),
     ]
+    assert rows[2]["ade_ft"] == pytest.approx(rows[3]["ade_ft"], rel=1e-4)  # sample 0 is the single forecast
+    assert rows[2]["min_ade_ft"] < rows[2]["ade_ft"]
     off = [0.01 * (h * h + h) for h in range(1, 13)]
     assert rows[0]["min_ade_ft"] == pytest.approx(sum(off) / 12, rel=1e-3)
     assert rows[0]["min_fde_ft"] == pytest.approx(off[-1], rel=1e-3)
@@ -76,7 +79,7 @@ def test_table_and_files(
     ]
     written = (out / "nba_score.md").read_text()
     assert "| SocialVAE, published | 20 | 0.64 | 1.17 | – |" in written
-    assert written.count("\n| ") == 1 + 3 + 2
+    assert written.count("\n| ") == 1 + 4 + 2
     for name in ("constant velocity", "constant velocity + noise", "run", "SocialVAE + FPC, published"):
         assert f"\n| {name} |" in written
         assert " ".join(name.split()[:2]) in printed
