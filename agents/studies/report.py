@@ -278,6 +278,7 @@ def _times(findings: Findings) -> list[Block]:
         trained = [r for r in results if r.curve]
         steps = sum(r.curve[-1]["steps"] for r in trained)
         seconds = sum(r.train_seconds for r in trained)
+        test_steps = sum(episode["length"] for r in results for episode in r.episodes)
         lines.append(
             [
                 findings.label(line),
@@ -285,10 +286,15 @@ def _times(findings: Findings) -> list[Block]:
                 f"{seconds / len(trained) / 60:.1f}" if trained else NOTHING,
                 f"{1000 * seconds / steps:.1f}" if steps else NOTHING,
                 f"{np.mean([r.measure_seconds for r in results]) / 60:.1f}",
+                f"{1000 * sum(r.measure_seconds for r in results) / test_steps:.1f}" if test_steps else NOTHING,
             ]
         )
-    headings = ["policy", "scenario", "minutes of a training", "ms per environment step", "minutes of test episodes"]
-    told = "Times of one process with one thread, beside others; a training's are without its measurements."
+    headings = ["policy", "scenario", "minutes of a training", "ms per environment step"]
+    headings += ["minutes of test episodes", "ms per test step"]
+    told = (
+        "Times of one process with one thread, beside others; a training's are without its measurements. A test step "
+        "is simulator, forecast and decision, without learning."
+    )
     return [Heading("Time"), Paragraph(told), Table(headings, lines)]
 
 
