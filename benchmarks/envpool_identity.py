@@ -1,12 +1,12 @@
 """Measures how often EnvPool's vehicles keep their identity from step to step, when it is inferred from their motion.
 
 `python -m benchmarks.envpool_identity` drives each task with random actions, hides the order of the vehicles from the
-reader by shuffling it at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders or
-removes a vehicle, which the same run checks by the vehicles' individual IDM exponents. `--replay` tracks scenes of
-highway-env as well, where vehicles also appear and vanish and the simulator gives their identity.
+reader by shuffling it at each step, and compares the identities with the true ones: each vehicle keeps its own IDM
+exponent for an episode, and vehicles of one exponent keep their order in the simulator's list, from which none of
+them may vanish. `--replay` tracks scenes of highway-env as well, where the simulator gives their identity.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -73,6 +73,11 @@ class Count:
         """Number of vehicle steps."""
         return self.kept + self.split + self.wrong
 
+    def add_named(self, before: Mapping[Any, int], now: Mapping[Any, int]) -> None:
+        """Adds the vehicles of one environment, given true name → number before and now."""
+        names = [*now, *(name for name in before if name not in now)]
+        self.add(*(np.array([known.get(name, -1) for name in names], dtype=np.int64) for known in (before, now)))
+
     def add(self, before: np.ndarray, now: np.ndarray) -> None:
         """Adds the vehicles of one environment, given their numbers before and now; -1 marks an absent vehicle."""
         there = (before >= 0) & (now >= 0)
@@ -90,41 +95,42 @@ def count_envpool(task_id: str, config: IdentityConfig) -> Count:
     pool.reset()
     reader = PoolReader(envpool_spec(task_id, pool.config), config.num_envs)
     env_indices = np.arange(config.num_envs)
-    states = pool.debug_states()
-    agents = len(states[0].vehicles)
-    count = Count()
-    before, drivers = _numbers(reader, states, env_indices, rng), _drivers(states)
-    while agents > 1 and count.pairs < config.vehicle_steps:
+    states, count = pool.debug_states(), Count()
+    before = _numbers(reader, states, env_indices, rng)
+    while any(before) and count.pairs < config.vehicle_steps:
         clock = [state.elapsed_step for state in states]
         pool.step(_actions(pool.action_space, config.num_envs, rng))
         states = pool.debug_states()
-        now, after = _numbers(reader, states, env_indices, rng), _drivers(states)
+        now = _numbers(reader, states, env_indices, rng)
         for i in env_indices:
             if states[i].elapsed_step <= clock[i]:
                 count.resets += 1
                 continue
-            if not np.array_equal(drivers[i], after[i]):
-                raise UserError(f"EnvPool's list of vehicles must keep its order, but changed it in {task_id}")
-            count.add(before[i], now[i])
-        before, drivers = now, after
+            if any(same for _, same in set(before[i]) ^ set(now[i])):
+                raise UserError(
+                    f"vehicles of one IDM exponent come or go in {task_id}, so none of them has an identity"
+                )
+            count.add_named(before[i], now[i])
+        before = now
     return count
 
 
-def _numbers(reader: PoolReader, states: Sequence[Any], envs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Returns the reader's numbers of the other vehicles (envs, others) in the simulator's order, hidden from it."""
-    order = 1 + rng.permutation(len(states[0].vehicles) - 1)
-    lists = [state.vehicles for state in states]
-    shown = [
-        SimpleNamespace(elapsed_step=state.elapsed_step, vehicles=[own[0], *(own[i] for i in order)])
-        for state, own in zip(states, lists, strict=True)
-    ]
-    numbers = np.empty((len(states), len(order)), dtype=np.int64)
-    numbers[:, order - 1] = reader.read_all(shown, envs).ids[:, 1:]
-    return numbers
+def _numbers(
+    reader: PoolReader, states: Sequence[Any], envs: np.ndarray, rng: np.random.Generator
+) -> list[dict[tuple[float, int], int]]:
+    """Returns true name → the reader's number for the other vehicles of each environment, whose order is hidden.
 
-
-def _drivers(states: Sequence[Any]) -> np.ndarray:
-    return np.array([[vehicle.idm_delta for vehicle in state.vehicles] for state in states])
+    A name is the IDM exponent, and how many vehicles before it in the simulator's list have the same.
+    """
+    lists, orders = [], [1 + rng.permutation(len(state.vehicles) - 1) for state in states]
+    names = list[list[tuple[float, int]]]()
+    for state, order in zip(states, orders, strict=True):
+        own = state.vehicles
+        exponents = [vehicle.idm_delta for vehicle in own]
+        names.append([(exponents[k], exponents[1:k].count(exponents[k])) for k in order])
+        lists.append(SimpleNamespace(elapsed_step=state.elapsed_step, vehicles=[own[0], *(own[k] for k in order)]))
+    found = reader.read_all(lists, envs).ids[:, 1:].tolist()
+    return [dict(zip(own, ids, strict=False)) for own, ids in zip(names, found, strict=True)]
 
 
 def _actions(space: gym.Space, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -154,10 +160,9 @@ def count_replay(env_id: str, config: IdentityConfig) -> Count:
         order = 1 + rng.permutation(len(scene.ids) - 1)
         states, present = scene.states[None, order], np.ones((1, len(order)), dtype=np.bool_)
         found = tracker.update(states[..., :2], states[..., 2:4], present, first, passed_s)[0]
-        now = dict(zip(scene.ids[order].tolist(), found.tolist(), strict=True))
+        now: dict[int, int] = dict(zip(scene.ids[order].tolist(), found.tolist(), strict=True))
         if not ended:
-            names = [*now, *(name for name in numbers if name not in now)]
-            count.add(*(np.array([known.get(name, -1) for name in names]) for known in (numbers, now)))
+            count.add_named(numbers, now)
         numbers, ended = now, not ended and (terminated or truncated)
         if episode > EMPTY and not count.pairs:
             raise UserError(f"{env_id} had no other vehicle in {EMPTY} episodes; leave it out of --replay")
