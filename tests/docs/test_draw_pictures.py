@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -33,3 +34,14 @@ def test_every_picture_is_shown_on_a_page():
     pages = (root / "README.md").read_text() + "".join(path.read_text() for path in (root / "docs").glob("*.md"))
     for name in draw_pictures.PICTURES:
         assert f"{name}.png)" in pages and (root / "docs" / f"{name}.png").exists()
+
+
+def test_coverage_without_modes_is_that_of_the_page():
+    page = (Path(__file__).parents[2] / "docs" / "in_env.md").read_text()
+    table = page.split("the checkpoints without modes had (K = 20):")[1].split("\n\n")[1]
+    found = {}
+    for line in table.splitlines()[2:]:
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        shares = [int(share) for share in re.findall(r"\d+", cells[-1])]
+        found[cells[0]] = (shares[0], shares[-1])
+    assert found == draw_pictures.BEFORE

@@ -265,3 +265,12 @@ def test_errors_in_the_loop_stand_beside_returns(tmp_path: Path):
     assert table[1:] == ["| forecast | one | 3.00 | 1.00 | 8.00 | 6.00 |"], "arms without errors have no line"
     write_report(tmp_path, found_in(study(), results()), "", MADE, [])
     assert "errors in the loop" not in (tmp_path / "report.md").read_text()
+
+
+def test_the_time_of_a_test_step_is_that_of_all_steps_of_an_arm(tmp_path: Path):
+    """Two episodes of five steps in each run, which take 6 s."""
+    found = [replace(one, episodes=tuple(e | {"length": 5} for e in one.episodes)) for one in results()]
+    write_report(tmp_path, found_in(study(), found), "", MADE, [])
+    text = (tmp_path / "report.md").read_text().split("## Time")[1]
+    [line] = [line for line in text.splitlines() if line.startswith("| forecast |")]
+    assert line.split("|")[-2].strip() == "600.0"

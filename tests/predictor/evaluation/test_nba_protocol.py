@@ -20,6 +20,7 @@ from predictor.evaluation.nba_protocol import (
     PlayerTally,
     drawn,
     fitted_noise,
+    fitted_residual,
     player_outcomes,
     protocol_windows,
 )
@@ -239,3 +240,18 @@ def test_what_is_no_store_of_possessions_is_refused(tmp_path: Path):
     message = "here: no window fits: episodes have at most 18 steps, a window needs 19; make it with --episode-steps 0"
     with pytest.raises(UserError, match=message):
         protocol_windows(short, Path("here"))
+
+
+def test_the_covariance_is_that_of_the_players_errors(tmp_path: Path):
+    """The ball jumps, and would add a hundred times as much."""
+
+    def parabola(entity: int, t: int) -> tuple[float, float]:
+        return (20.0 + 50 * (t % 2), 5.0) if entity == -1 else (float(entity), 0.01 * t**2)
+
+    store = store_of(tmp_path, (26,), (parabola,))
+    windows = protocol_windows(store, tmp_path)
+    noisy = fitted_residual(ConstantVelocity(windows.spec, HORIZON_STEPS), windows)
+    off_m = [0.01 * (h * h + h) * FOOT_M for h in range(1, HORIZON_STEPS + 1)]
+    std_m = noisy.std_m(HORIZON_STEPS).numpy()
+    np.testing.assert_allclose(std_m[:, 1], off_m, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(std_m[:, 0], 0.0, atol=1e-4)
