@@ -73,6 +73,9 @@ class TrainConfig:
     edge_geometry: bool = True
     """Whether relative position, relative speed and time to contact are inputs of the dG-VAE's edges
     (`geometry_scales`, fitted to the data, if any step has two agents). No effect on other models."""
+    surroundings: bool = False
+    """Whether what is nearest to an agent ahead, behind and in the lanes beside it is an input of its edges, too; needs
+    `edge_geometry`. No effect on other models."""
     causal_edges: bool = False
     """Whether the causal labels of the stores are the known edges (`--label-weight`, `--type-label-weight`), in place
     of leaders and followers; where a store has none, edges are unknown."""
