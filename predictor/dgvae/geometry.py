@@ -61,7 +61,8 @@ class Geometry(nn.Module):
 def across(heading: Tensor, where: Tensor, ahead: Tensor, squared: Tensor, least: float) -> Tensor:
     """Computes the distance across the heading: to the left in the plane, without a side in space.
 
-    There it is at least `least`, so that it has a gradient."""
+    There it is at least `least`, so that it has a gradient.
+    """
     if where.shape[-1] == 2:
         return heading[..., :1] * where[..., 1:] - heading[..., 1:] * where[..., :1]
     return ((squared - ahead.square()).clamp(min=0) + least**2).sqrt()
