@@ -20,6 +20,8 @@ _LANE = 0.2
 _BESIDE = 0.1
 """Distance along the heading, as a share of the typical one, below which an agent is beside, neither ahead nor behind;
 the agent itself, at 0, is nowhere."""
+_LOUD = 4.0
+"""Factor of all features: with it they vary as much as those of a pair's geometry, and are learned as fast."""
 _NEAR = 0.3
 """Addend to speeds, as in `predictor.dgvae.geometry`: directions vanish smoothly with the speed."""
 
@@ -50,8 +52,8 @@ class Surroundings(nn.Module):
         """Computes how near the nearest agent of each place is, and how fast it comes nearer or gets away.
 
         Places are the lane to the right, the own one and the one to the left, each ahead and behind. Lanes are strips
-        along the agent's heading, with soft borders; in space there is no right and left. All is between 0 and 1, and 0
-        where nobody is.
+        along the agent's heading, with soft borders; in space there is no right and left. All is at least 0, and 0 where
+        nobody is.
 
         Args:
             graph: pairs of the agents, `Padded` or `Packed`.
@@ -66,7 +68,7 @@ class Surroundings(nn.Module):
         beside = across(heading, where, ahead, where.square().sum(-1, keepdim=True), 0.1 * _LANE)
         in_lane = torch.exp(-((beside - self._lanes) / (0.5 * _LANE)).square())
         sides = torch.cat([ahead, -ahead], dim=-1).relu()
-        near = sides / (_BESIDE + sides) / (1 + sides)
+        near = _LOUD * sides / (_BESIDE + sides) / (1 + sides)
         leaving = functional.softsign(torch.cat([faster, -faster], dim=-1))
         kinds = torch.cat([near, near * (-leaving).relu(), near * leaving.relu()], dim=-1)
         found: Tensor = graph.most((in_lane[..., None] * kinds[..., None, :]).flatten(-2))

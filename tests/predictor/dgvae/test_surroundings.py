@@ -11,7 +11,7 @@ from torch import Tensor
 
 from predictor.dgvae import DGVAE
 from predictor.dgvae.packing import Packed, Padded
-from predictor.dgvae.surroundings import _NEAR, Surroundings
+from predictor.dgvae.surroundings import _LOUD, _NEAR, Surroundings
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, PLURAL, spec
@@ -35,7 +35,7 @@ def around(*others: list[float], units: tuple[float, ...] = (1.0,) * 4) -> dict[
 def near(distance_m: float) -> float:
     forward = 100 / math.sqrt(100**2 + _NEAR**2)
     share = distance_m / DISTANCE_M * forward
-    return share / (0.1 + share) / (1 + share)
+    return _LOUD * share / (0.1 + share) / (1 + share)
 
 
 def test_a_leader_that_comes_nearer_is_ahead_on_the_own_lane():
