@@ -52,8 +52,8 @@ class Surroundings(nn.Module):
         """Computes how near the nearest agent of each place is, and how fast it comes nearer or gets away.
 
         Places are the lane to the right, the own one and the one to the left, each ahead and behind. Lanes are strips
-        along the agent's heading, with soft borders; in space there is no right and left. All is at least 0, and 0 where
-        nobody is.
+        along the agent's heading, with soft borders; in space there is no right and left. All is at least 0, and 0
+        where nobody is.
 
         Args:
             graph: pairs of the agents, `Padded` or `Packed`.
