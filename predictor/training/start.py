@@ -119,6 +119,6 @@ def _fill(model: nn.Module, source: nn.Module, config: TrainConfig) -> None:
     if wanted != given:
         raise UserError(
             f"--set {' '.join(config.set)} needs other weights than checkpoint '{config.init}' has; change only fields "
-            "that leave their shapes, such as static_dim, or leave --init out"
+            "that leave their shapes, such as static_dim, or surroundings=true, or leave --init out"
         )
     model.load_state_dict(weights)
