@@ -204,8 +204,10 @@ def test_a_checkpoint_without_surroundings_is_given_them_and_forecasts_as_before
     began.train_step()
     assert added.abs().max() > 0
     second = train(config(circles, tmp_path / "fourth", init=first, set=("surroundings=true",)))
-    assert load_checkpoint(second)[0].config.surroundings
-    assert made(config(circles, tmp_path / "fifth", init=str(second))).model.config.surroundings
+    trained = load_checkpoint(second)[0]
+    again = made(config(circles, tmp_path / "fifth", init=str(second))).model
+    assert again.config.surroundings and trained.encoder.conv_surroundings.weight.abs().max() > 0
+    torch.testing.assert_close(again.encoder.conv_surroundings.weight, trained.encoder.conv_surroundings.weight)
     with pytest.raises(UserError, match="leave out surroundings$"):
         config(circles, tmp_path / "sixth", init=first, surroundings=True)
 
