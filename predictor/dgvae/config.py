@@ -61,9 +61,6 @@ class DGVAEConfig:
     geometry_scales: tuple[float, ...] = ()
     """Typical distance [m] and relative speed [m/s] of neighbours; if given, the geometry of each pair at these scales
     is an input of its edge and of its messages (`predictor.dgvae.geometry`)."""
-    surroundings: bool = False
-    """Whether what is nearest to an agent ahead, behind and in the lanes beside it is an input of its edges, at
-    `geometry_scales` (`predictor.dgvae.surroundings`)."""
     forget_bias: float = 0.0
     """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
     innovation_rounds: int = 0
@@ -148,8 +145,6 @@ class DGVAEConfig:
         scales = self.geometry_scales
         if scales and (len(scales) != 2 or not all(0 < scale < float("inf") for scale in scales)):
             raise UserError(f"geometry_scales needs a distance [m] and a speed [m/s], both positive, got {scales}")
-        if self.surroundings and not scales:
-            raise UserError("surroundings needs geometry_scales, got none; set surroundings to false")
         if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 

@@ -53,16 +53,13 @@ class Geometry(nn.Module):
         distance = (squared + _NEAR**2).sqrt()
         closing = -(where * moving).sum(-1, keepdim=True) / distance
         ahead, faster = ((vector * heading).sum(-1, keepdim=True) for vector in (where, moving))
-        beside = across(heading, where, ahead, squared, _NEAR)
+        beside = _across(heading, where, ahead, squared)
         features = torch.cat([apart, ahead, beside, faster, distance, closing, closing / distance], dim=-1)
         return functional.softsign(features)
 
 
-def across(heading: Tensor, where: Tensor, ahead: Tensor, squared: Tensor, least: float) -> Tensor:
-    """Computes the distance across the heading: to the left in the plane, without a side in space.
-
-    There it is at least `least`, so that it has a gradient.
-    """
+def _across(heading: Tensor, where: Tensor, ahead: Tensor, squared: Tensor) -> Tensor:
+    """Computes the distance across the heading: to the left in the plane, without a side in space."""
     if where.shape[-1] == 2:
         return heading[..., :1] * where[..., 1:] - heading[..., 1:] * where[..., :1]
-    return ((squared - ahead.square()).clamp(min=0) + least**2).sqrt()
+    return ((squared - ahead.square()).clamp(min=0) + _NEAR**2).sqrt()

@@ -33,7 +33,6 @@ from predictor.dgvae.planned_run import PlannedRun
 from predictor.dgvae.reading import Reading
 from predictor.dgvae.self_edges import SelfEdges
 from predictor.dgvae.single_step import Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
-from predictor.dgvae.surroundings import Surroundings
 from predictor.dgvae.training_pass import TrainingPass
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import NO_AGENT, nearest, pair_mask
@@ -71,12 +70,10 @@ class DGVAE(nn.Module):
         if self.sees_changes:
             check_scales("change_scales", config.change_scales, spec)
         inputs = self.codec.num_inputs
-        geometry = surroundings = None
+        geometry = None
         if config.geometry_scales:
-            units = self.codec.scales[: 2 * spec.position_dim]
-            geometry = Geometry(units, *config.geometry_scales)
-            surroundings = Surroundings(units, *config.geometry_scales) if config.surroundings else None
-        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes, geometry, surroundings)
+            geometry = Geometry(self.codec.scales[: 2 * spec.position_dim], *config.geometry_scales)
+        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes, geometry)
         self.decoder = Decoder(config, inputs, spec.num_features, geometry)
         self.self_edges: SelfEdges | None = None
         if config.num_modes:

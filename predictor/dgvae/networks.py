@@ -16,8 +16,6 @@ from torch.nn import functional
 from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
-from predictor.dgvae.packing import Padded
-from predictor.dgvae.surroundings import Surroundings
 from predictor.graph import self_pairs
 from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
@@ -71,17 +69,11 @@ def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 class Encoder(nn.Module):
     """Computes edge logits and features from states, step by step or for many steps at once."""
 
-    def __init__(
-        self,
-        config: DGVAEConfig,
-        inputs: int,
-        geometry: Geometry | None = None,
-        surroundings: Surroundings | None = None,
-    ) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.config = config
-        self.geometry, self.surroundings = geometry, surroundings
+        self.geometry = geometry
         width, rnn = config.hidden_dim, config.rnn_dim
         self.embed = nn.Linear(inputs, width)
         self.conv_pair = PairLinear(width, width, relative=True)
@@ -91,8 +83,6 @@ class Encoder(nn.Module):
         if geometry is not None:
             self.conv_geometry = nn.Linear(geometry.num_features, width, bias=False)
             self.edge_geometry = nn.Linear(geometry.num_features, width, bias=False)
-        if surroundings is not None:
-            self.conv_surroundings = nn.Linear(surroundings.num_features, width, bias=False)
         self.forward_input = nn.Linear(width, 4 * rnn)
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
@@ -123,10 +113,7 @@ class Encoder(nn.Module):
         summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed, to_conv), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
-        nodes = functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias
-        if self.surroundings is not None:
-            nodes = nodes + self.conv_surroundings(self.surroundings(Padded(pairs, senders), inputs))
-        nodes = functional.elu(nodes)
+        nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
         return self.edge_pair.elu(nodes, senders, extra=to_edge)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:

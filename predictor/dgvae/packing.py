@@ -51,10 +51,6 @@ class Padded(NamedTuple):
         """Returns the entries of each pair's receiver and sender, left to broadcasting."""
         return ends(nodes, self.senders)
 
-    def most(self, pairs: Tensor) -> Tensor:
-        """Returns the largest entry over each agent's senders; entries must not be negative, no sender gives 0."""
-        return (pairs * self.present[..., None]).amax(-2)
-
     def own(self, pairs: Tensor) -> Tensor:
         """Returns the entry of each agent's pair with itself, which is the last slot where senders are listed."""
         if self.senders is None:
@@ -179,12 +175,6 @@ class Packed:
         """Returns the entries of each pair's receiver and sender."""
         receivers, senders = (self.roles // 2).unbind(1)
         return nodes.index_select(0, receivers), nodes.index_select(0, senders)
-
-    def most(self, pairs: Float[Tensor, "pairs out"]) -> Float[Tensor, "listed out"]:
-        """Returns the largest entry over each agent's senders; entries must not be negative, no sender gives 0."""
-        there = pairs[: len(self.slots)]
-        receivers = self.receivers[:, None].expand_as(there)
-        return there.new_zeros(len(self.counts), there.shape[1]).scatter_reduce_(0, receivers, there, "amax")
 
     def own(self, pairs: Float[Tensor, "pairs pair"]) -> Float[Tensor, "listed pair"]:
         """Returns the entry of each listed agent's pair with itself."""

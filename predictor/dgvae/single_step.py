@@ -178,10 +178,7 @@ class Stepper:
         geometry = None if self._geometry is None else self._geometry(*graph.ends(inputs))
         summed = graph.gather(elu_(_spread(inputs, self._conv, graph, geometry, self._conv_geometry)))
         nodes = _product(summed, (self._conv_out[0], None))
-        nodes = nodes.addcmul_(graph.counts, self._conv_out[1])
-        if self._surroundings is not None:
-            nodes = _product(self._surroundings(graph, inputs), self._conv_surroundings, nodes)
-        nodes = elu_(nodes)
+        nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
         edges = elu_(_spread(nodes, self._edge, graph, geometry, self._edge_geometry))
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
@@ -266,9 +263,6 @@ class Stepper:
         self._edge_geometry: Layer | None = None
         if encoder.geometry is not None:
             self._conv_geometry, self._edge_geometry = _layer(encoder.conv_geometry), _layer(encoder.edge_geometry)
-        self._surroundings = encoder.surroundings
-        if encoder.surroundings is not None:
-            self._conv_surroundings = (encoder.conv_surroundings.weight.detach(), None)
         self._gates = folded(encoder.forward_input, encoder.edge_out)
         self._recurrent = (encoder.forward_hidden.weight.detach(), None)
         heads = [encoder.prior_head, encoder.feature_head] if encoder.config.edge_feature_dim else [encoder.prior_head]

@@ -18,7 +18,7 @@ TrainPrecision = Literal["float32", "tf32", "bfloat16"]
 DataDevice = Literal["auto", "cpu", "device"]
 Capture = Literal["auto", "off"]
 Keep = Literal["best", "last"]
-OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry", "surroundings")
+OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
 OF_THE_NETWORK = ("preset", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
@@ -53,7 +53,7 @@ class TrainConfig:
     "paper", and half of them otherwise."""
     set: tuple[str, ...] = ()
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16. With `init`, those
-    that leave the weights' shapes as they are (static_dim, dropout), or `surroundings`, whose weights begin at 0."""
+    that leave the weights' shapes as they are (static_dim, dropout)."""
     init: str = ""
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
     leave out the options of the network, but for `set`; frame and range of perception are the data's. Empty starts from
@@ -73,9 +73,6 @@ class TrainConfig:
     edge_geometry: bool = True
     """Whether relative position, relative speed and time to contact are inputs of the dG-VAE's edges
     (`geometry_scales`, fitted to the data, if any step has two agents). No effect on other models."""
-    surroundings: bool = False
-    """Whether what is nearest to an agent ahead, behind and in the lanes beside it is an input of its edges, too; needs
-    `edge_geometry`. No effect on other models."""
     causal_edges: bool = False
     """Whether the causal labels of the stores are the known edges (`--label-weight`, `--type-label-weight`), in place
     of leaders and followers; where a store has none, edges are unknown."""
@@ -188,10 +185,6 @@ class TrainConfig:
         without = [name for name in of_rollouts if getattr(self, name) and not self.rollout_weight]
         if without:
             raise UserError(f"{without[0]} is of roll-outs, and rollout_weight is 0; leave one of them out")
-        if self.surroundings and not self.edge_geometry:
-            raise UserError(
-                "surroundings need the scales of edge_geometry; leave --no-edge-geometry or --surroundings out"
-            )
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import torch
 from torch import nn
 
 from predictor.checkpoint import load_checkpoint
@@ -17,9 +16,6 @@ from predictor.support.remote import address
 from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change, typical_label, typical_neighbour, typical_spread
 from predictor.training.rescaling import SCALES, rescaled
-
-_ADDED = "encoder.conv_surroundings.weight"
-"""Weights that a checkpoint can be given: at 0, they leave its forecasts as they are."""
 
 
 def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
@@ -38,7 +34,6 @@ def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episod
             fitted["input_scales"] = typical_spread(episodes, spec)
         if config.edge_geometry:
             fitted["geometry_scales"] = typical_neighbour(episodes, spec)
-            fitted["surroundings"] = config.surroundings and bool(fitted["geometry_scales"])
         fitted |= _labels(config, episodes)
     return configure(config.model, config.preset, config.set, **fitted)
 
@@ -107,18 +102,17 @@ def _check_modes(config: TrainConfig, network: Any) -> None:
 
 
 def _fill(model: nn.Module, source: nn.Module, config: TrainConfig) -> None:
-    """Gives the model the weights of the checkpoint; where it has one more input, the surroundings, that begins at 0.
+    """Gives the model the weights of the checkpoint.
 
     Raises:
         UserError: --set made another network.
     """
-    weights = {**source.state_dict()}
-    if (added := model.state_dict().get(_ADDED)) is not None:
-        weights.setdefault(_ADDED, torch.zeros_like(added))
-    wanted, given = ({name: tuple(w.shape) for name, w in some.items()} for some in (model.state_dict(), weights))
+    wanted, given = (
+        {name: tuple(weight.shape) for name, weight in network.state_dict().items()} for network in (model, source)
+    )
     if wanted != given:
         raise UserError(
             f"--set {' '.join(config.set)} needs other weights than checkpoint '{config.init}' has; change only fields "
-            "that leave their shapes, such as static_dim, or surroundings=true, or leave --init out"
+            "that leave their shapes, such as static_dim, or leave --init out"
         )
-    model.load_state_dict(weights)
+    model.load_state_dict(source.state_dict())

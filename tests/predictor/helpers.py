@@ -47,7 +47,6 @@ RICH = replace(
     substeps=2,
     gated_messages=True,
     geometry_scales=(2.0, 1.5),
-    surroundings=True,
 )
 # An edge of each agent to itself, with types that are its futures; every other option that fits, too.
 PLURAL = replace(
@@ -58,7 +57,6 @@ PLURAL = replace(
     change_scales=(3.0, 3.0, 2.0, 2.0),
     static_dim=2,
     geometry_scales=(2.0, 1.5),
-    surroundings=True,
 )
 SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH, "plural": PLURAL}
 # Every kind of trainable forecaster: its name in `predictor.models`, and a small config.

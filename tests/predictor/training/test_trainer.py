@@ -184,34 +184,6 @@ def test_a_network_that_nothing_was_said_about_is_plural_and_has_all_inputs(circ
     assert replace(made_of, delta_scales=(), **dict.fromkeys(INPUTS.values(), ())) == plural
 
 
-def test_surroundings_are_an_option_that_needs_the_scales_of_geometry(circles: Path, tmp_path: Path):
-    settings = config(circles, tmp_path, surroundings=True)
-    assert fitted_config(settings, load_data(settings)).surroundings
-    assert math.isfinite(made(settings).validate()[0].min_ade_m)
-    alone = config(write_circles(tmp_path / "alone", agents=1), tmp_path / "run", surroundings=True)
-    assert not fitted_config(alone, load_data(alone)).surroundings
-    with pytest.raises(UserError, match="surroundings need the scales of edge_geometry; leave --no-edge-geometry or"):
-        replace(settings, edge_geometry=False)
-
-
-def test_a_checkpoint_without_surroundings_is_given_them_and_forecasts_as_before(circles: Path, tmp_path: Path):
-    first = str(train(config(circles, tmp_path / "first")))
-    began = made(config(circles, tmp_path / "second", init=first, set=("surroundings=true",)))
-    before = load_checkpoint(first)[0]
-    added = began.model.encoder.conv_surroundings.weight
-    assert began.model.config == replace(before.config, surroundings=True) and added.abs().max() == 0
-    assert began.validate()[0] == made(config(circles, tmp_path / "third", init=first)).validate()[0]
-    began.train_step()
-    assert added.abs().max() > 0
-    second = train(config(circles, tmp_path / "fourth", init=first, set=("surroundings=true",)))
-    trained = load_checkpoint(second)[0]
-    again = made(config(circles, tmp_path / "fifth", init=str(second))).model
-    assert again.config.surroundings and trained.encoder.conv_surroundings.weight.abs().max() > 0
-    torch.testing.assert_close(again.encoder.conv_surroundings.weight, trained.encoder.conv_surroundings.weight)
-    with pytest.raises(UserError, match="leave out surroundings$"):
-        config(circles, tmp_path / "sixth", init=first, surroundings=True)
-
-
 def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
     settings = config(circles, tmp_path, model="mlp", set=("delta_scales=1,2,3,4",))
     assert fitted_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
@@ -222,11 +194,8 @@ def test_inputs_of_the_dgvae_have_no_effect_on_other_models(circles: Path, tmp_p
     settings = config(circles, tmp_path, model=model)
     data = load_data(settings)
     without = replace(settings, **dict.fromkeys(INPUTS, False))
-    more = replace(settings, surroundings=True)
-    assert fitted_config(settings, data) == fitted_config(without, data) == fitted_config(more, data)
-    assert (
-        settings.without_effect == (*INPUTS, "surroundings") and replace(settings, model="dgvae").without_effect == ()
-    )
+    assert fitted_config(settings, data) == fitted_config(without, data)
+    assert settings.without_effect == tuple(INPUTS) and replace(settings, model="dgvae").without_effect == ()
 
 
 def test_geometry_is_left_out_where_no_step_has_two_agents(tmp_path: Path):
