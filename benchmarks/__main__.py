@@ -56,7 +56,7 @@ def main() -> None:
     console.print(rich_table(lines)) if console.is_terminal else print(plain(lines))
     if comparison is not None and baseline is not None:
         if baseline.processor != processor():
-            print(f"the baseline is of another processor ({baseline.processor}): wider tolerances for equivalents")
+            print(f"the baseline is of another processor ({baseline.processor}): wider tolerances")
         print("\n".join(comparison.report()))
         if comparison.failing:
             sys.exit(1)
