@@ -9,11 +9,20 @@ from matplotlib import pyplot as plt
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 from predictor.evaluation.accuracy import Accuracy
 from predictor.reports.looks import STYLE, looks_of
 from predictor.support.files import new_file
+
+
+class PlainLogFormatter(LogFormatter):
+    """Writes 0.2 at the ticks that matplotlib labels, where its own formatters write formulas (`looks.AS_TEXT`)."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Returns the label of the tick at `x`, empty where matplotlib leaves it out."""
+        return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def save_figure(figure: Figure, path: Path, dpi: int) -> None:
@@ -54,6 +63,8 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
         style: dict[str, Any] = {"lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3, **look}
         ax.errorbar(time_s, view["by_step_m"], yerr=errors, label=result["name"], **style)
     ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(PlainLogFormatter())
+    ax.yaxis.set_minor_formatter(PlainLogFormatter())
     ax.set_xlabel("time ahead [s]")
     return ax
 

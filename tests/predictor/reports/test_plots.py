@@ -70,3 +70,5 @@ def test_figures_by_step_have_room_for_the_names_of_their_lines(name: str):
     drawn = [text.get_text() for text in figure.legends[0].get_texts()]
     assert drawn == [line.name for line in table.lines if line.key != "least-squares"]
     assert "best of 7" in figure.axes[0].get_ylabel()
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels(which="both")]
+    assert "1" in labels and not any("$" in label for label in labels)
