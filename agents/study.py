@@ -24,7 +24,7 @@ from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.files import check_out, delete_leftovers, new_file, write_text
 from predictor.support.jobs import LOG_FILE
 from predictor.support.locks import locked
 from predictor.support.memory import check_processes
@@ -150,8 +150,9 @@ def _check_folder(folder: Path) -> None:
 def _keep_file(folder: Path, text: str) -> None:
     """Writes the study's file into the folder; the file of an earlier run is kept if it was another one."""
     earlier = folder / STUDY_FILE
-    if earlier.exists() and (before := earlier.read_text(encoding="utf-8")) != text:
-        write_text(folder / EARLIER_FILE, before)
+    if earlier.exists() and (before := earlier.read_bytes()) != text.encode():
+        with new_file(folder / EARLIER_FILE) as partial:
+            partial.write_bytes(before)
         print(f"{earlier} was of another study or an earlier version; kept as {EARLIER_FILE}", file=sys.stderr)
     write_text(earlier, text)
 

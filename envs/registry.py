@@ -191,6 +191,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     import highway_env  # noqa: F401  (registers its ids)
 
     from envs.simulators import costly_collisions, mixed_traffic  # noqa: F401  (register their ids)
+    from envs.simulators.idm_constants import restore_idm_constants
 
     register_envpool_ids()
     module, colon, _ = env_id.partition(":")
@@ -201,6 +202,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         raise UserError(f"cannot make env '{env_id}': render_mode must be a text, got {short(mode)}")
     try:
         env = gym.make(env_id, **kwargs)
+        restore_idm_constants(env)
         if isinstance(config := kwargs.get("config"), Mapping):
             check_settings(env, config)
         return env

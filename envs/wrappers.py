@@ -26,6 +26,7 @@ from envs.readers import MakeReader, reader_for
 from envs.readers.base import Reader, bounded, build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
+from envs.simulators.idm_constants import restore_idm_constants
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
@@ -127,6 +128,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         Raises:
             UserError: the first observation does not lie in the env's own space.
         """
+        restore_idm_constants(self.env)
         obs, info = self.env.reset(seed=seed, options=options)
         if "reset" in self._unchecked:
             check_own(self._own_spaces, obs, f"env '{self.scene_source}'")

@@ -82,7 +82,7 @@ def road_interventions(env: AbstractEnv) -> dict[int, Intervention]:
     """Returns the interventions that act on the next frame, by agent."""
     standing = env.road.__dict__.get("act")
     found = [] if standing is None else standing.running
-    return {one.intervention.agent: one.intervention for one in found if one.frames > 0 or one.lingers}
+    return {one.intervention.agent: one.intervention for one in found if one.frames > 0 or not one.can_end()}
 
 
 class RoadInterventions:
@@ -131,9 +131,6 @@ class _Override:
         frames: number of simulated frames that are left.
     """
 
-    lingers = False
-    """Whether it may last longer than its steps."""
-
     def __init__(self, vehicle: Any, intervention: Intervention, env: AbstractEnv) -> None:
         self.vehicle, self.intervention, self.road = vehicle, intervention, env.road
         per_step = int(env.config["simulation_frequency"] // env.config["policy_frequency"])
@@ -156,6 +153,10 @@ class _Override:
     def after(self) -> None:
         """Follows the road; called after the drivers decided."""
         self._lane = getattr(self.vehicle, "target_lane_index", None)
+
+    def can_end(self) -> bool:
+        """Returns whether it may end now, if no frames are left."""
+        return True
 
     def end(self) -> bool:
         """Gives the vehicle back to its driver; returns whether that was possible."""
@@ -234,8 +235,6 @@ class _LaneChange(_Override):
 
 
 class _Absence(_Override):
-    lingers = True
-
     def begin(self) -> None:
         """Takes the vehicle out of the road's list; its driver goes on and sees the others."""
         self._place = self.road.vehicles.index(self.vehicle)
@@ -249,9 +248,13 @@ class _Absence(_Override):
         self.vehicle.act()
         self.vehicle.step(self.dt_s)
 
+    def can_end(self) -> bool:
+        """Returns whether the vehicle's place is free."""
+        return all(self._leaves_room(other) for other in [*self.road.vehicles, *self.road.objects])
+
     def end(self) -> bool:
         """Puts the vehicle back if its place is free."""
-        if not all(self._leaves_room(other) for other in [*self.road.vehicles, *self.road.objects]):
+        if not self.can_end():
             return False
         self.road.vehicles.insert(min(self._place, len(self.road.vehicles)), self.vehicle)
         return True

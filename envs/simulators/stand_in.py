@@ -8,6 +8,7 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 
+from envs.simulators.idm_constants import SHIPPED
 from envs.simulators.interventions import simulator_of
 
 
@@ -18,9 +19,9 @@ class StandIn(IDMVehicle):
     at an intersection `seat_driver` gives it those.
     """
 
-    DISTANCE_WANTED = 5.0 + IDMVehicle.LENGTH
-    COMFORT_ACC_MAX = 3.0
-    COMFORT_ACC_MIN = -5.0
+    DISTANCE_WANTED = SHIPPED["DISTANCE_WANTED"]
+    COMFORT_ACC_MAX = SHIPPED["COMFORT_ACC_MAX"]
+    COMFORT_ACC_MIN = SHIPPED["COMFORT_ACC_MIN"]
 
     index_to_speed = MDPVehicle.index_to_speed
     speed_to_index = MDPVehicle.speed_to_index
@@ -55,4 +56,4 @@ def _written_constants(simulator: AbstractEnv) -> dict[str, float]:
     if not isinstance(simulator, IntersectionEnv):
         return {}
     traffic = utils.class_from_path(simulator.config["other_vehicles_type"])
-    return {name: getattr(traffic, name) for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")}
+    return {name: getattr(traffic, name) for name in SHIPPED}

@@ -12,8 +12,10 @@ import numpy as np
 
 from predictor.data.dataset_card import most_present
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.store_files import check_new_store
+from predictor.scene import MOST_AGENTS
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_at_most
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.provenance import provenance
 from predictor.support.remote import address
@@ -47,6 +49,7 @@ class CrowdConfig:
             UserError: a value out of range.
         """
         check_at_least(self, 1, "num_agents", "episodes")
+        check_at_most(self, MOST_AGENTS, "num_agents")
         check_at_least(self, 0, "seed")
         if not self.num_agents:
             raise UserError("num_agents needs at least one number; leave it out for the default ones")
@@ -89,9 +92,11 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
         for _ in range(config.episodes):
             chosen: list[Episode] = []
             order: list[int] = []
-            while sum(int(e.valid[config.at_step].sum()) for e in chosen) < wanted:
+            present = 0
+            while present < wanted:
                 order = order or rng.permutation(len(usable)).tolist()
                 chosen.append(usable[order.pop()])
+                present += int(chosen[-1].valid[config.at_step].sum())
             crowds.append(overlay(chosen, store.info.spec.position_dim, len(crowds), config.episode_steps))
     return crowds
 
@@ -99,6 +104,7 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
 def main() -> None:
     """Entry point."""
     config = parse(CrowdConfig, __doc__)
+    check_new_store(config.out, config.overwrite)
     crowds = make_crowds(config)
     source = read_store(config.source).info
     made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}

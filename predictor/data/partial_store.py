@@ -110,9 +110,15 @@ class PartialStore:
             raise UserError("no agent could be perturbed in any episode, so there are no branches; raise --max-steps")
         if self.skipped:
             if not episodes:
+                failed, played = len(self.skipped), self.num_done + self._added
                 self._forget()  # so that the next attempt plays them
                 first = next(iter(self.skipped.values()))
-                raise UserError(f"all {len(self.skipped)} episodes failed, the first so: {first}")
+                if failed < played:
+                    raise UserError(
+                        f"{failed} of {played} episodes failed, the first so: {first}; "
+                        "in the others no agent could be perturbed: raise --max-steps"
+                    )
+                raise UserError(f"all {failed} episodes failed, the first so: {first}")
             named = {str(seed): reason for seed, reason in sorted(self.skipped.items())}
             info = replace(info, provenance=info.provenance | {"skipped": {"episodes": len(named), "reasons": named}})
         write_store(self._path, info, episodes, overwrite)

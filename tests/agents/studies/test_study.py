@@ -296,6 +296,17 @@ def test_the_file_of_another_study_is_kept(
     )
 
 
+def test_a_file_of_another_study_that_is_no_text_is_kept_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(agents.study, "_run_missing", lambda *given: [])
+    monkeypatch.setattr(agents.study, "_write", lambda *given: None)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "study.toml").write_bytes(b'title = "\xff"\n')
+    assert run_study(config(tmp_path, study_text())) == 0
+    assert (out / "study.before.toml").read_bytes() == b'title = "\xff"\n'
+    assert (out / "study.toml").read_text() == study_text()
+
+
 def test_a_folder_with_something_else_is_refused(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("mine")

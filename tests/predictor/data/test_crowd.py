@@ -68,6 +68,7 @@ def test_no_scene_lies_upon_itself_before_all_are_in(tmp_path: Path):
     [
         ({"num_agents": (3, 0)}, r"num_agents must be at least 1, got \(3, 0\)"),
         ({"at_step": 10}, "at_step must lie between 0 and 9, got 10"),
+        ({"num_agents": (3, 70_000)}, r"num_agents must be at most 65,536, got \(3, 70000\)"),
     ],
 )
 def test_refused(tmp_path: Path, changes: dict[str, object], message: str):
@@ -80,3 +81,11 @@ def test_scenes_with_an_ego_or_too_short_ones_are_refused(tmp_path: Path):
         make_crowds(config(store(tmp_path / "a", [circling_episode(0)], has_ego=True)))
     with pytest.raises(UserError, match="no episode has 10 steps and an agent at step 7"):
         make_crowds(config(store(tmp_path / "b", [circling_episode(0, steps=6)])))
+
+
+def test_a_store_that_exists_is_said_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    source = store(tmp_path, [circling_episode(0, agents=2)])
+    monkeypatch.setattr("predictor.data.crowd.make_crowds", lambda _: pytest.fail("no crowd is made yet"))
+    monkeypatch.setattr("sys.argv", ["crowd", "--source", str(source), "--out", str(source)])
+    with pytest.raises(UserError, match="scenes exists; choose another path or pass --overwrite"):
+        main()

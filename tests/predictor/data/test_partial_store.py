@@ -180,6 +180,18 @@ def test_a_recording_without_any_episode_says_why(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_without_any_episode_says_what_failed_and_what_had_nobody(tmp_path: Path):
+    with (
+        pytest.raises(UserError, match="1 of 3 episodes failed, the first so: it hangs; in the others .* --max-steps"),
+        PartialStore(tmp_path / "store", SETTINGS_A, part_s=0.0) as partial,
+    ):
+        partial.add(INFO)
+        partial.skip(1, "it hangs")
+        partial.add(INFO)
+        partial.finish(INFO)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_recording_of_which_all_seeds_were_skipped_keeps_nothing(tmp_path: Path):
     """The next attempt plays them, perhaps in an environment that was mended."""
     with (
