@@ -58,8 +58,9 @@ def test_an_env_that_was_made_before_is_right_after_its_reset():
     assert constants() == SHIPPED
 
 
-def test_an_intersection_keeps_its_own():
+def test_an_intersection_keeps_its_own_beside_another():
     env = SceneObservation(make_env("intersection-v2"))
     env.reset(seed=0)
+    make_env("intersection-v2").close()
     env.step(1)
     assert constants()["DISTANCE_WANTED"] == 7
