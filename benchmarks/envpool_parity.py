@@ -26,6 +26,7 @@ from envs.readers import reader_for
 from envs.registry import make_env
 from envs.seeding import driver_rng
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF, begins_alike
+from envs.simulators.idm_constants import SHIPPED
 from envs.wrappers import ForecastObservation
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
@@ -37,7 +38,6 @@ _SAME_M = 1e-6
 """Largest distance of two vehicles that count as being in the same place [m]."""
 _CONTINUOUS = "Intersection-v1"
 """Task whose ego steers and accelerates; random actions are drawn from discrete ones here."""
-_DRIVER = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def copy_state(state: Any, env: gym.Env) -> list[Any]:
 @contextmanager
 def untouched_drivers() -> Iterator[None]:
     """Restores the parameters of IDM drivers, which highway-env's intersection changes for the whole process."""
-    kept = {name: getattr(IDMVehicle, name) for name in _DRIVER}
+    kept = {name: getattr(IDMVehicle, name) for name in SHIPPED}
     try:
         yield
     finally:

@@ -59,7 +59,8 @@ def test_the_section_measures_both_graphs_and_fits_from_its_threshold(tiny: None
     assert fits["exponent of memory"].value == pytest.approx(2.0)
     assert fits["exponent of time"].what["agents"] == "4 to 6"
     assert all(r.what["graph"] == "2 nearest" for r in fits.values())  # one dense count is no line
-    assert fits["exponent of time"].compared is not None
+    tolerances = {name: fits[f"exponent of {name}"].compared.tolerance for name in ("time", "memory")}  # type: ignore[union-attr]
+    assert tolerances["time"] > 1.4 > tolerances["memory"]  # times of one commit differ by so much
 
 
 def test_what_does_not_fit_into_memory_is_skipped_with_a_note(tiny: None, monkeypatch: pytest.MonkeyPatch):
