@@ -9,7 +9,7 @@ from predictor.evaluation import paper_tables
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.paper_tables import Table
 from predictor.reports.looks import GREY
-from predictor.reports.plots import figure_by_step, plot_error_by_horizon, plot_scene
+from predictor.reports.plots import PlainLogFormatter, figure_by_step, plot_error_by_horizon, plot_scene
 
 
 @pytest.fixture
@@ -72,3 +72,15 @@ def test_figures_by_step_have_room_for_the_names_of_their_lines(name: str):
     assert "best of 7" in figure.axes[0].get_ylabel()
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels(which="both")]
     assert "1" in labels and not any("$" in label for label in labels)
+
+
+def test_a_logarithmic_axis_over_decades_has_labels_at_powers_of_ten_alone():
+    figure = Figure()
+    ax = figure.subplots()
+    ax.set_yscale("log")
+    ax.set_ylim(1e-4, 2.0)
+    ax.yaxis.set_major_formatter(PlainLogFormatter())
+    ax.yaxis.set_minor_formatter(PlainLogFormatter())
+    figure.canvas.draw()
+    labels = {text.get_text() for text in ax.get_yticklabels(which="both")} - {""}
+    assert {"0.001", "0.1", "1"} <= labels and not labels & {"0.002", "0.03", "0.5"}
