@@ -11,7 +11,7 @@ from typing import Any
 
 from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_of_folder, resolve
 from predictor.data.store import EpisodeStore, read_store
-from predictor.evaluation.in_env_record import measurements_of, update_record
+from predictor.evaluation.in_env_record import measurements_of, read_record, updated, write_record
 from predictor.forecaster import has_scale
 from predictor.reports.in_env_tables import PLURAL, card_section
 from predictor.reports.tables import MODEL_NAMES
@@ -68,8 +68,8 @@ def write_card(config: CardConfig) -> Path:
         raise UserError(f"data are the stores that '{name}' was trained on ({wanted}), got {given or 'none'}")
     stores = "\n".join(_store_line(path, store) for path, store in opened.items())
     training = _training(name, info)
-    # only now that all inputs are read: a new record beside an old card would contradict it
-    measured = [m for m in update_record(folder, found) if m.samples == found[0].samples]
+    record = updated(read_record(folder), found)
+    measured = [m for m in record if m.samples == found[0].samples]
     ego = "the ego included" if info.spec.has_ego else "no ego"
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     plural = has_scale(model)
@@ -97,6 +97,7 @@ def write_card(config: CardConfig) -> Path:
         ]
     )
     path = folder / "README.md"
+    write_record(folder, record)  # only now that the card is made: a new record beside an old card would contradict it
     write_text(path, text + "\n")
     return path
 

@@ -101,7 +101,7 @@ def resolve(name: str | Path) -> Path:
     is downloaded, once in a process.
 
     Raises:
-        UserError: none of them exists, or the hub does not give it.
+        UserError: none of them exists, it is "constant-velocity", which has no weights, or the hub does not give it.
     """
     if not isinstance(name, str | Path) or not str(name).strip() or "\0" in str(name):
         raise UserError(f"a checkpoint is a folder or a shipped name, got {short(repr(name), 60)}")
@@ -120,6 +120,8 @@ def resolve(name: str | Path) -> Path:
         return PRETRAINED / str(name)
     if path.is_dir():
         return best if holds_best and not holds else path
+    if str(name) == CONSTANT_VELOCITY:
+        raise UserError(f"'{name}' has no weights; pass a checkpoint")
     if is_own(name):
         raise UserError(f"'{name}' is a forecaster of your own and no checkpoint; pass one with weights")
     raise UserError(
@@ -188,8 +190,6 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
         UserError: the name is "constant-velocity", which has no weights, or the folder is not there, is not a predictor
             checkpoint, has another version, is truncated, or does not fit its own config.
     """
-    if str(name) == CONSTANT_VELOCITY:
-        raise UserError(f"'{name}' has no weights; pass a checkpoint")
     path = resolve(name)
     with named(path, name):
         info = read_info(path)

@@ -212,7 +212,7 @@ def _shown(
 def _agent_names(agents: int, store: StoreInfo) -> list[str]:
     """Returns the joint names if the store has them and all joints are present, else numbers."""
     joints = store.provenance.get("joints", ())
-    if len(joints) == agents:
+    if isinstance(joints, list) and len(joints) == agents:
         return [str(joint) for joint in joints]
     return ["ego" if store.spec.has_ego and not i else str(i) for i in range(agents)]
 

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import load_checkpoint, name_of_folder
+from predictor.checkpoint import load_checkpoint, names_of
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
 from predictor.evaluation import nba_protocol
@@ -106,10 +106,11 @@ def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
     """Returns the errors of constant velocity and of each checkpoint, each also with noise around its single forecast.
 
     Raises:
-        UserError: `out` is a file, a store or checkpoint is unreadable, or their specs differ.
+        UserError: `out` is a file, a checkpoint is given twice, a store or checkpoint is unreadable, or specs differ.
     """
     if config.out is not None:
         check_out(config.out)
+    labels = names_of(config.checkpoint)
     models = [load_checkpoint(name, config.device) for name in config.checkpoint]
     windows = protocol_windows(read_store(config.data), config.data)
     for name, (_, info) in zip(config.checkpoint, models, strict=True):
@@ -122,7 +123,7 @@ def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
         noise = fitted_noise(training, drawn(training, config.max_windows, config.seed))
         lines.append(_measured("constant velocity + noise", noise, windows, config))
     for name, (model, _) in zip(config.checkpoint, models, strict=True):
-        label = name_of_folder(name)
+        label = labels[name]
         if training is not None:
             noisy = fitted_residual(model, training, config.seed, config.device)
             lines.append(_measured(f"{label}, single forecast + Gaussian", noisy, windows, config))

@@ -151,7 +151,7 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
     """Trains, logs, validates and saves until the run is finished, or a signal asks it to stop."""
     config, printed = trainer.config, 0
     with (
-        SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
+        SummaryWriter(str(config.out / "tb"), purge_step=_first_unknown(trainer)) as writer,
         WorkShown("train", config.steps, trainer.step) as progress,
         deferred_stops() as stops,
     ):
@@ -194,6 +194,11 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
                 f"stopped at step {trainer.step:,} of {config.steps:,}: {trainer.stale} validations without a better "
                 "score; with --resume and a larger --patience it goes on"
             )
+
+
+def _first_unknown(trainer: Trainer) -> int:
+    """Returns the first step whose points of the curves are still to be logged; a killed run has logged more."""
+    return trainer.step + (trainer.step > 0 and not trainer.owes_validation)
 
 
 def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, Any]) -> str:

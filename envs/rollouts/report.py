@@ -120,7 +120,7 @@ def remarks(result: "EnvAccuracy") -> str:
     graph = result.graph
     if graph is not None and graph.accuracy is not None:
         f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"
-        always = 100 * max(graph.true_connectivity or 0, 1 - (graph.true_connectivity or 0))
+        always = 100 * (graph.commonest or 0)
         lines.append(
             f"graph accuracy {100 * graph.accuracy:.1f} % of {graph.pairs} pairs (always the commoner answer: "
             f"{always:.1f} %), F1 of edges {f1}"

@@ -93,7 +93,7 @@ class SpringsConfig:
     ood: int = 10_000
     """Number of rollouts out of distribution: p = 0.5, k ∈ {1, 2, 3} (charges: twice the strength)."""
     edge_probability: float = 0.7
-    """Probability of a spring between two particles (paper: 0.7)."""
+    """Probability of a spring between two particles (paper: 0.7); charges act on all pairs."""
     kicks: float = 0.0
     """Share of rollouts in which one particle is kicked: at a random frame its velocity changes by `kick_mps` in a
     random direction. The store marks the kicked particle from the frame before (`perturbed`). 0 simulates none."""
@@ -115,6 +115,8 @@ class SpringsConfig:
         check_at_least(self, 0, "train", "val", "test", "ood", "seed")
         if not 0 <= self.edge_probability <= 1:
             raise UserError(f"edge_probability must lie between 0 and 1, got {self.edge_probability}")
+        if self.physics.kind == "charged" and self.edge_probability != SpringsConfig.edge_probability:
+            raise UserError(f"charges act on all pairs, got edge_probability {self.edge_probability}; leave it out")
         if not 0 <= self.kicks <= 1:
             raise UserError(f"kicks must lie between 0 and 1, got {self.kicks}")
         check_positive(self, "kick_mps")

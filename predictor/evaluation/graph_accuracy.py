@@ -55,6 +55,8 @@ class GraphAccuracy:
     constant probability of 0.5. Types given without probabilities count as certain."""
     true_connectivity: float | None = None
     """Share of pairs with a true edge: the accuracy of predicting "edge" for all pairs (with two types)."""
+    commonest: float | None = None
+    """Share of pairs of the commonest true type: the accuracy of predicting it for all pairs."""
     confusion: list[list[int]] | None = None
     """Number of pairs by true type (outer list) and most likely type (inner list), after renaming."""
     permutation: tuple[int, ...] | None = None
@@ -143,6 +145,7 @@ class GraphTally:
             recall=_ratio(hits, true),
             brier=_ratio(self._brier[permutation.index(0)], pairs),
             true_connectivity=_ratio(true, pairs),
+            commonest=_ratio(confusion.sum(1).max(), pairs),
             confusion=confusion.tolist() if pairs else None,
             permutation=permutation,
         )

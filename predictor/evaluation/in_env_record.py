@@ -122,10 +122,11 @@ def measurements_of(accuracy: dict[str, Any], checkpoint: str) -> list[Measureme
     """Returns the measurements of a checkpoint in the content of an accuracy.json of `envs.evaluate`.
 
     Raises:
-        KeyError, TypeError: the content is not of such a file.
+        KeyError, TypeError, AttributeError, UserError: the content is not of such a file.
     """
     results = [result for result in accuracy["results"] if result["checkpoint"] == checkpoint]
-    return [_measurement(result, accuracy["config"], accuracy["provenance"]) for result in results]
+    found = [_measurement(result, accuracy["config"], accuracy["provenance"]) for result in results]
+    return [from_table(Measurement, asdict(measurement), checkpoint) for measurement in found]
 
 
 def read_record(folder: Path) -> list[Measurement]:
@@ -146,14 +147,17 @@ def read_record(folder: Path) -> list[Measurement]:
     return list(content.measurements)
 
 
-def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measurement]:
-    """Puts measurements into `in_env.json`, in place of those with the same key, with their remarks; returns all."""
+def updated(recorded: Sequence[Measurement], found: Sequence[Measurement]) -> list[Measurement]:
+    """Returns a record with measurements in place of those with the same key, whose remarks they get."""
     new = {measurement.key: measurement for measurement in found}
-    kept = [replace(new.pop(old.key), note=old.note) if old.key in new else old for old in read_record(folder)]
-    everything = [*kept, *new.values()]
-    entries = [{k: v for k, v in asdict(m).items() if v is not None and (k, v) != ("note", "")} for m in everything]
+    kept = [replace(new.pop(old.key), note=old.note) if old.key in new else old for old in recorded]
+    return [*kept, *new.values()]
+
+
+def write_record(folder: Path, measurements: Sequence[Measurement]) -> None:
+    """Writes `in_env.json` of a checkpoint's folder."""
+    entries = [{k: v for k, v in asdict(m).items() if v is not None and (k, v) != ("note", "")} for m in measurements]
     write_json(folder / FILE_NAME, {"measurements": entries})
-    return everything
 
 
 def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
@@ -198,7 +202,8 @@ def _of_samples(result: dict[str, Any]) -> dict[str, Any]:
     for figure in ("coverage", "mixture_coverage"):
         covered = [c for c in many.get(figure) or [] if c is not None]
         found[figure] = (min(covered), max(covered)) if covered else None
-    found["overlap"] = (many["overlap"], many["true_overlap"])
+    overlap = many["overlap"], many["true_overlap"]
+    found["overlap"] = None if None in overlap else overlap
     found["controls"] = {
         key: Control(
             one["min_ade_m"],

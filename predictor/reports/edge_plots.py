@@ -175,15 +175,14 @@ def graphs_figure(
         axes[0, column].set_title(f"{_percentile(column)} window: {window.place}\ntruth", fontsize=10)
         what = "pairs" if symmetric else "ordered pairs"
         axes[1, column].set_title(
-            f"inferred: {right} of {all_pairs} {what} right ({right / all_pairs:.2f})", fontsize=10
+            f"inferred: edge or none right for {right} of {all_pairs} {what} ({right / all_pairs:.2f})", fontsize=10
         )
         for ax in axes[:, column]:
             _frame(ax, on_circle)
-    commoner = None if graph.true_connectivity is None else max(graph.true_connectivity, 1 - graph.true_connectivity)
     figure.legend(handles=_edge_legend(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(
-        f"{where}: accuracy {plain(graph.accuracy)} over all ordered pairs (always the more frequent answer: "
-        f"{plain(commoner)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
+        f"{where}: accuracy {plain(graph.accuracy)} over all ordered pairs (always the commonest type: "
+        f"{plain(graph.commonest)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
         + ("" if on_circle else "; arrows go from sender to receiver"),
         fontsize=10,
     )

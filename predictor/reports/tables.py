@@ -102,8 +102,8 @@ def _graph_lines(content: dict[str, Any]) -> str:
     graph, apart = content["graph"], content["separation"]
     lines = [
         f"* accuracy {plain(graph['accuracy'])}, F1 {plain(graph['f1'])} over {graph['pairs']} ordered pairs; "
-        f"predicting 'edge' for all pairs has accuracy {plain(graph['true_connectivity'])}, 'no edge' for all "
-        f"{plain(None if graph['true_connectivity'] is None else 1 - graph['true_connectivity'])}"
+        f"predicting the commonest type for all pairs has accuracy {plain(graph['commonest'])}; "
+        f"{plain(graph['true_connectivity'])} of them have an edge"
     ]
     if apart is not None:
         lines.append(

@@ -15,7 +15,6 @@ from predictor.forecaster import Futures, TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.pairs import Total, masked_mean, of_one_process
 from predictor.support.config_checks import check_choice
-from predictor.support.errors import UserError
 from predictor.training.config import Likelihood, TrainConfig
 from predictor.training.mode_loss import energy_terms, spread_nll, unit
 
@@ -209,12 +208,6 @@ def _graph_loss(
             loss = loss + config.type_label_weight * labelled
             terms["type_label"] = labelled
     if config.label_weight and batch.edge_attributes is not None and output.features is not None:
-        missing = batch.edge_attributes.shape[-1] - output.features.shape[-1]
-        if missing > 0:
-            raise UserError(
-                f"restricted labelling of {batch.edge_attributes.shape[-1]} attributes needs as many edge features, "
-                f"got {output.features.shape[-1]}; raise edge_feature_dim or set label_weight to 0"
-            )
         # causal attributes say themselves where they are known, others are known on edges
         labelled = pairs
         if batch.edge_types is not None and not config.causal_edges:

@@ -66,11 +66,22 @@ def _check_moments(path: Path, optimizer: dict[Any, Any], model: nn.Module) -> N
     for place, entry in moments.items():
         if not isinstance(entry, dict) or not set(_MOMENTS) <= entry.keys() or not _is_place(place, parameters):
             raise _damaged(path, f"'optimizer' must hold {', '.join(_MOMENTS)} of each weight")
+        if not _is_count(entry["step"]):
+            raise _damaged(path, "'optimizer' must hold step as a number of at least 0")
         for name in _MOMENTS[1:]:
             if not isinstance(entry[name], Tensor) or entry[name].shape != parameters[place].shape:
                 raise _damaged(path, f"'optimizer' has a moment {name} of another shape than its weight")
-            if not bool(torch.isfinite(entry[name]).all()):
+            if not entry[name].is_floating_point() or not bool(torch.isfinite(entry[name]).all()):
                 raise _damaged(path, f"'optimizer' has a moment {name} that is not finite")
+        if bool((entry["exp_avg_sq"] < 0).any()):
+            raise _damaged(path, "'optimizer' has a mean square exp_avg_sq below 0")
+
+
+def _is_count(step: Any) -> bool:
+    """Returns whether it is a finite number of at least 0, or a tensor of one."""
+    if isinstance(step, Tensor) and step.numel() == 1 and not step.is_complex():
+        step = step.item()
+    return type(step) in (int, float) and math.isfinite(step) and step >= 0
 
 
 def _is_place(place: Any, parameters: list[nn.Parameter]) -> bool:

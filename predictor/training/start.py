@@ -38,11 +38,20 @@ def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episod
     return configure(config.model, config.preset, config.set, **fitted)
 
 
-def _labels(config: TrainConfig, episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Returns fields of the network's config that say which attributes its first feature dimensions learn."""
+def _labels(config: TrainConfig, episodes: Sequence[Episode], learned: Any = None) -> dict[str, Any]:
+    """Returns fields of the network's config that say which attributes its first feature dimensions learn.
+
+    Args:
+        config: the training's config.
+        episodes: episodes to which mean and standard deviation of each attribute are fitted.
+        learned: config of a network whose weights are kept; those of attributes that it has learned stay as they are.
+    """
     if not (config.label_weight and config.causal_edges):
         return {}
     found = [typical_label(episodes, column) for column in range(len(CAUSAL_ATTRIBUTES))]
+    for column, name in enumerate(CAUSAL_ATTRIBUTES if learned and learned.label_means else ()):
+        if found[column] and learned.feature_labels[column : column + 1] == (name,):
+            found[column] = learned.label_means[column], learned.label_scales[column]
     names = (name if label else "" for name, label in zip(CAUSAL_ATTRIBUTES, found, strict=True))
     means, scales = zip(*(label or (0.0, 1.0) for label in found), strict=True)
     return {"feature_labels": tuple(names), "label_means": means, "label_scales": scales}
@@ -54,11 +63,11 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     Raises:
         UserError: as `model_config`; or the checkpoint cannot be read, is of another model or network, or its scenes
             have other features, or an ego where the data's have none, or none where the data's have one; or only its
-            spread shall be trained, and it has none, or another horizon; or modes would not learn.
+            spread shall be trained, and it has none, or another horizon; or modes, or labels of edges, would not learn.
     """
     if not config.init:
         network = model_config(config, spec, episodes)
-        _check_modes(config, network)
+        _check_learns(config, network, episodes)
         return build(config.model, spec, network, config.horizon_steps)
     source, info = load_checkpoint(config.init)
     if info.model != config.model:
@@ -69,8 +78,8 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
         if config.refit_scales:
             fitted = model_config(replace(config, set=(f"residual={info.config.residual}",)), spec, episodes)
             source = rescaled(source, info.model, {name: getattr(fitted, name) for name in SCALES}, info.horizon_steps)
-        network = changed(replace(source.config, **_labels(config, episodes)), config.set)
-        _check_modes(config, network)
+        network = changed(replace(source.config, **_labels(config, episodes, source.config)), config.set)
+        _check_learns(config, network, episodes)
         plain = build(info.model, spec, network, config.horizon_steps)
         _fill(plain, source, config)
         return plain
@@ -91,12 +100,19 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     return model
 
 
-def _check_modes(config: TrainConfig, network: Any) -> None:
-    """Checks that the modes of a network, where it has them, can learn.
+def _check_learns(config: TrainConfig, network: Any, episodes: Sequence[Episode]) -> None:
+    """Checks that the modes of a network, where it has them, and its edge features, where they are labelled, can learn.
 
     Raises:
-        UserError: the training has no roll-outs.
+        UserError: the training has no roll-outs, or the network fewer edge features than the data have attributes.
     """
+    attributes = max((e.edge_attributes.shape[-1] for e in episodes if e.edge_attributes is not None), default=0)
+    features = getattr(network, "edge_feature_dim", 0)
+    if config.label_weight and attributes > features:
+        raise UserError(
+            f"restricted labelling of {attributes} attributes needs as many edge features, got {features}; raise "
+            "edge_feature_dim or set label_weight to 0"
+        )
     if getattr(network, "num_modes", 0) and not config.rollout_weight:
         raise UserError("modes learn from roll-outs, and rollout_weight is 0; pass --preset fast, or a weight")
 

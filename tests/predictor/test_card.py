@@ -13,7 +13,7 @@ from predictor.evaluation.in_env_record import read_record
 from predictor.support.errors import UserError
 from tests.predictor.helpers import circling_episode, model, spec, write_circles
 
-ROW = {
+ROW: dict[str, Any] = {
     "checkpoint": "toy",
     "env_id": "toy-v0",
     "driver": "idle",
@@ -88,6 +88,28 @@ def test_card_without_its_accuracy_is_refused(config: CardConfig, content: Any, 
     with pytest.raises(UserError, match=message):
         write_card(config)
     assert_nothing_is_written(config)
+
+
+@pytest.mark.parametrize(
+    ("changes", "shown"),
+    [
+        ({"model": {"min_ade_m": "abc", "min_fde_m": 2.5}}, "min_ade_m must be a number, got 'abc'"),
+        ({"driver": 5}, "driver must be a text, got 5"),
+        ({"reduction_interval": [1]}, "below_cv_interval must have 2 entries, got 1"),
+        ({"model_samples": ROW["model_samples"] | {"coverage": ["a"]}}, "coverage must be a number, got 'a'"),
+    ],
+)
+def test_figures_of_another_type_are_refused(config: CardConfig, changes: dict[str, Any], shown: str):
+    config.accuracy.write_text(json.dumps(RESULTS | {"results": [ROW | changes]}))
+    with pytest.raises(UserError, match=f"is not an accuracy.json of envs.evaluate .*{shown}"):
+        write_card(config)
+    assert_nothing_is_written(config)
+
+
+def test_a_share_of_overlaps_that_was_not_measured_is_left_out(config: CardConfig):
+    samples = ROW["model_samples"] | {"overlap": None}
+    config.accuracy.write_text(json.dumps(RESULTS | {"results": [ROW | {"model_samples": samples}]}))
+    assert "| toy-v0 | 20 | dG-VAE | 0.750 | 0.875 | 0.500 | – | – |" in write_card(config).read_text()
 
 
 def test_card_without_its_stores_is_refused(config: CardConfig, tmp_path: Path):

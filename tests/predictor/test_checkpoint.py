@@ -322,9 +322,10 @@ def test_scenes_of_its_own_spec_are_taken(path: Path):
     assert load_forecaster(path, INFO.spec, "env 'a'").horizon_steps == 4
 
 
-def test_constant_velocity_has_no_weights():
+@pytest.mark.parametrize("load", [load_checkpoint, resolve])
+def test_constant_velocity_has_no_weights(load: Callable[[str], object]):
     with pytest.raises(UserError, match="^'constant-velocity' has no weights; pass a checkpoint$"):
-        load_checkpoint("constant-velocity")
+        load("constant-velocity")
 
 
 def test_constant_velocity_takes_every_spec():

@@ -541,7 +541,8 @@ def test_smoke_of_driving_where_agents_come_and_go(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
+@pytest.mark.parametrize("joints", [["hip", "toe"], 7, None])
+def test_types_without_attributes_and_joints_with_names(joints: Any, tmp_path: Path):
     layout = SceneSpec(
         1.0, ("world",) * 3, feature_names=KINEMATIC_FEATURES_3D, feature_scales=(1.0,) * 6, has_ego=False, max_agents=9
     )
@@ -549,7 +550,7 @@ def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
     types = np.zeros((1, 2, 2), dtype=np.int8)
     types[0, 0, 1] = 1
     episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2), edge_types=types)
-    write_store(tmp_path / "solid", StoreInfo(layout, "solid", {"joints": ["hip", "toe"]}), [episode])
+    write_store(tmp_path / "solid", StoreInfo(layout, "solid", {"joints": joints}), [episode])
     checkpoint = saved(tmp_path / "toy", layout, static_dim=6)  # all of them: no dynamic block
     found = interpret(InterpretConfig(str(checkpoint), tmp_path / "solid", tmp_path / "out", 3, 4, 2, num_samples=1))
     assert found.attributes == [] and found.disentanglement is None and found.reading is None

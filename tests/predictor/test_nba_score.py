@@ -1,4 +1,5 @@
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -93,6 +94,15 @@ def test_a_model_that_keeps_velocities_scores_as_constant_velocity(store: Path, 
     save_checkpoint(tmp_path / "zero", model, CheckpointInfo(scene_spec(), FAST_LIKE, 12))
     straight, zero = measure(NbaScoreConfig(store, (str(tmp_path / "zero"),), num_samples=1))
     assert (zero.min_ade_ft, zero.min_fde_ft) == pytest.approx((straight.min_ade_ft, straight.min_fde_ft), rel=1e-4)
+
+
+def test_checkpoints_that_are_called_alike_have_rows_of_their_own(store: Path, checkpoint: Path, tmp_path: Path):
+    shutil.copytree(checkpoint, tmp_path / "other" / "run")
+    runs = str(checkpoint), str(tmp_path / "other" / "run")
+    names = [line.name for line in measure(NbaScoreConfig(store, runs, max_windows=1))]
+    assert names == ["constant velocity", f"{tmp_path.name}/run", "other/run"]
+    with pytest.raises(UserError, match="each checkpoint is given once"):
+        measure(NbaScoreConfig(store, (runs[0], f"{runs[0]}/checkpoint")))
 
 
 def test_some_windows_and_some_rows(store: Path):

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 import zarr
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from predictor import train as training
 from predictor.checkpoint import load_checkpoint
@@ -318,8 +319,13 @@ def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path
 
 def test_more_steps_may_be_asked_for_on_resuming(tiny: None, circles: Path, tmp_path: Path):
     train(config(circles, tmp_path / "run", steps=2))
-    train(config(circles, tmp_path / "run", steps=5, resume=True))
+    more = config(circles, tmp_path / "run", steps=5, resume=True)
+    train(more)
     assert state(tmp_path / "run")["step"] == 5
+    train(more)  # a run that is finished
+    curves = EventAccumulator(str(tmp_path / "run" / "tb")).Reload()
+    steps = [point["step"] for point in json.loads((tmp_path / "run" / "curve.json").read_text())]
+    assert [point.step for point in curves.Scalars("val/energy_m")] == steps and {2, 5} <= set(steps)
 
 
 def test_best_checkpoint_is_kept_and_a_stale_run_stops(

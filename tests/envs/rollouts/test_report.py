@@ -35,7 +35,7 @@ def result(env_id: str = "tag", checkpoint: str = "mine", reduction: float = 0.5
 
 
 def full() -> EnvAccuracy:
-    graph = GraphAccuracy(120, 0.3, accuracy=0.875, f1=0.5, true_connectivity=0.25)
+    graph = GraphAccuracy(120, 0.3, accuracy=0.875, f1=0.5, true_connectivity=0.25, commonest=0.75)
     histories = {1: accuracy("dG-VAE, 1 step of history", 1.5)}
     controls = {RESIDUAL: accuracy(RESIDUAL, 0.75, 20), NEIGHBOURS: accuracy(NEIGHBOURS, 1.25, 20)}
     many = replace(accuracy("dG-VAE", 0.5, 20), mixture_coverage=[0.75, 1.0, 0.875])

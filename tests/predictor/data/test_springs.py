@@ -360,6 +360,10 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *wo
     [
         (["--train", "-1"], "train must not be negative, got -1"),
         (["--edge-probability", "1.5"], "edge_probability must lie between 0 and 1, got 1.5"),
+        (
+            ["--physics.kind", "charged", "--edge-probability", "0.5"],
+            "charges act on all pairs, got edge_probability 0.5; leave it out",
+        ),
         (["--physics.frames", "1"], "frames must be at least 2, got 1"),
         (["--physics.substeps", "0"], "substeps must be positive, got 0"),
         (["--physics.box-m", "-5"], "box_m must be positive, got -5.0"),

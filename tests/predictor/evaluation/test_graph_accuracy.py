@@ -76,6 +76,13 @@ def test_probabilities_and_their_types_agree():
     assert second.brier == pytest.approx(np.mean(((probs.argmax(-1) > 0) != (truth > 0))[valid].numpy()))
 
 
+def test_the_commonest_type_is_one_of_all_types_not_edge_or_none():
+    truth = torch.tensor([[0, 1, 1], [2, 0, 2], [2, 1, 0]])[None]
+    truth[0, 0, 1] = 2
+    found = tallied((torch.ones_like(truth), truth, PAIRS), types=3).results()
+    assert (found.true_connectivity, found.commonest, found.accuracy) == pytest.approx((1.0, 4 / 6, 2 / 6))
+
+
 @pytest.mark.slow
 @given(sets)
 def test_against_scikit_learn(batch: tuple[Tensor, Tensor, Tensor]):

@@ -10,7 +10,8 @@ from predictor.evaluation.in_env_record import (
     Measurement,
     measurements_of,
     read_record,
-    update_record,
+    updated,
+    write_record,
 )
 from predictor.support.errors import UserError
 
@@ -18,20 +19,20 @@ FIRST = Measurement("toy-v0", "varied", 50, 20, "python -m envs.evaluate", "abc"
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path):
-    assert update_record(tmp_path, [FIRST]) == read_record(tmp_path) == [FIRST]
+    write_record(tmp_path, [FIRST])
+    assert read_record(tmp_path) == [FIRST]
 
 
-def test_a_later_measurement_replaces_the_one_of_the_same_env_driver_and_k(tmp_path: Path):
+def test_a_later_measurement_replaces_the_one_of_the_same_env_driver_and_k():
     again = Measurement("toy-v0", "varied", 10, 20, "later", "def", 4.0)
     others = [Measurement("toy-v0", "idle", 50, 20, "", "", 3.0), Measurement("toy-v0", "varied", 6, 1, "", "", 3.0)]
-    update_record(tmp_path, [FIRST, *others])
-    assert update_record(tmp_path, [again]) == read_record(tmp_path) == [again, *others]
+    assert updated([FIRST, *others], [again]) == [again, *others]
 
 
-def test_a_later_measurement_keeps_the_remark_of_the_one_that_it_replaces(tmp_path: Path):
+def test_a_later_measurement_keeps_the_remark_of_the_one_that_it_replaces():
     again = replace(FIRST, commit="def", min_ade_m=4.0)
-    update_record(tmp_path, [replace(FIRST, note="retrained after a first look")])
-    assert update_record(tmp_path, [again]) == [replace(again, note="retrained after a first look")]
+    old = replace(FIRST, note="retrained after a first look")
+    assert updated([old], [again]) == [replace(again, note="retrained after a first look")]
 
 
 def test_a_folder_without_a_record_has_no_measurements(tmp_path: Path):

@@ -338,12 +338,6 @@ def test_terms_are_for_reading_only():
     assert total.requires_grad and not any(part.requires_grad for part in parts.values())
 
 
-def test_more_attributes_than_features_are_refused():
-    attributes = torch.zeros(1, 3, 2, 2, 3)
-    with pytest.raises(UserError, match="restricted labelling of 3 attributes needs as many edge features, got 1"):
-        terms(replace(SILENT, label_weight=1.0), batch(None, attributes), output(features=torch.zeros(1, 3, 2, 2, 1)))
-
-
 def test_an_unknown_likelihood_is_named():
     unchecked: Any = inspect.unwrap(nll)  # shape checks would refuse it first
     states = torch.zeros(2, 4)

@@ -31,11 +31,17 @@ def test_a_state_is_read_as_it_was_written(tmp_path: Path):
         (0, "exp_avg", torch.full((1, 2), torch.nan), "moment exp_avg that is not finite"),
         (1, "exp_avg_sq", torch.full((1,), torch.inf), "moment exp_avg_sq that is not finite"),
         (0, "exp_avg", torch.zeros(3), "moment exp_avg of another shape than its weight"),
+        (0, "exp_avg", torch.zeros(1, 2, dtype=torch.long), "moment exp_avg that is not finite"),
+        (1, "exp_avg_sq", torch.full((1,), -1.0), "mean square exp_avg_sq below 0"),
+        (1, "step", torch.tensor(-1.0), "must hold step as a number of at least 0"),
+        (1, "step", torch.tensor(torch.nan), "must hold step as a number of at least 0"),
+        (1, "step", torch.ones(3), "must hold step as a number of at least 0"),
+        (1, "step", "one", "must hold step as a number of at least 0"),
         ("weight", "exp_avg", torch.zeros(1, 2), "must hold step, exp_avg"),
         (2, "exp_avg", torch.zeros(1, 2), "must hold step, exp_avg"),
     ],
 )
-def test_damaged_moments_are_one_sentence(tmp_path: Path, place: Any, name: str, value: torch.Tensor, message: str):
+def test_damaged_moments_are_one_sentence(tmp_path: Path, place: Any, name: str, value: Any, message: str):
     model, state = saved(tmp_path)
     moments = state["optimizer"]["state"]
     moments[place] = dict(moments.get(place, moments[0])) | {name: value}

@@ -704,7 +704,7 @@ def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
         load_data(config(circles, tmp_path / "second", val_data=(tmp_path / "equals",)))
 
 
-def write_followers(path: Path) -> Path:
+def write_followers(path: Path, speed_mps: float = 20.0, gap_s: float = 0.0) -> Path:
     """Circles with causal labels (an intervention on agent 0 moves agent 1 by 2 m); agent 0 leads agent 1."""
     episodes = []
     for i in range(6):
@@ -713,7 +713,7 @@ def write_followers(path: Path) -> Path:
         types = np.tile(-np.eye(agents, dtype=np.int8), (steps, 1, 1))
         shift_m = np.full((steps, agents, agents), np.nan, dtype=np.float32)
         attributes = np.zeros((steps, agents, agents, 2), dtype=np.float32)
-        types[:, 1, 0], shift_m[:, 1, 0], attributes[:, 1, 0] = 1, 2.0, (20.0 + i, 1.0)
+        types[:, 1, 0], shift_m[:, 1, 0], attributes[:, 1, 0] = 1, 2.0, (speed_mps + i, 1.0 + gap_s * i)
         episodes.append(replace(plain, edge_types=types, edge_attributes=attributes, causal_shift_m=shift_m))
     names = ("desired_speed_mps", "time_gap_s")
     info = StoreInfo(spec(), "circles", edge_attribute_names=names, causal_threshold_m=1.0)
@@ -740,6 +740,25 @@ def test_features_learn_what_is_known_of_edges_in_units_of_its_spread(tmp_path: 
     assert "label" in trainer.train_step()
     plain = made(config(data, tmp_path / "third", causal_edges=True))
     assert not plain.model.config.feature_labels and "label" not in plain.train_step()
+
+
+def test_features_that_are_learned_keep_their_unit(tmp_path: Path):
+    """Weights that are kept emit what they emitted before; what they have not learned is fitted to the new data."""
+    first = train(config(write_followers(tmp_path / "one"), tmp_path / "first", **LABELS))
+    before = load_checkpoint(first)[1].config
+    faster = write_followers(tmp_path / "two", speed_mps=100.0, gap_s=2.0)
+    after = made(config(faster, tmp_path / "second", init=str(first), **LABELS)).model.config
+    assert after.feature_labels == ("desired_speed_mps", "", "leader", "time_gap_s")
+    assert (after.label_means[0], after.label_scales[0]) == (before.label_means[0], before.label_scales[0])
+    assert before.label_means[0] < 30 and after.label_means[3] > 2
+
+
+def test_more_attributes_than_features_are_refused_before_a_run_is_made(tmp_path: Path):
+    data, out = write_followers(tmp_path / "followers"), tmp_path / "out"
+    few = config(data, out, label_weight=1.0, set=("edge_feature_dim=1",))
+    with pytest.raises(UserError, match="restricted labelling of 2 attributes needs as many edge features, got 1"):
+        train(few)
+    assert not out.exists()
 
 
 @pytest.mark.slow
