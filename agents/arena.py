@@ -25,9 +25,10 @@ from agents.vec_envs import (
 from envs.drivers.all_agents import has_heuristic, make_driver
 from envs.parallel import living
 from envs.readers.base import role_of
-from envs.sb3.acting import ActingPolicy, space_as_stored
+from envs.sb3.acting import ActingPolicy, sizes_of_space, space_as_stored
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
+from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError, short
 
 
@@ -89,7 +90,7 @@ def _acting(policy: BaseAlgorithm, venv: VecEnv) -> ActingPolicy:
         trained, found = (_parts(space_as_stored(getattr(of, f"{what}_space"))) for of in (policy, venv))
         for key in dict.fromkeys((*trained, *found)):
             own, here = trained.get(key), found.get(key)
-            if own is None or here is None or _sizes(own) != _sizes(here):
+            if own is None or here is None or sizes_of_space(own) != sizes_of_space(here):
                 name = f"{what} '{key}'" if key else what
                 raise UserError(
                     f"the policy was trained with the {name} {short(own)}, got {short(here)}; give the environment the "
@@ -100,13 +101,6 @@ def _acting(policy: BaseAlgorithm, venv: VecEnv) -> ActingPolicy:
 
 def _parts(space: gym.Space) -> Mapping[str, gym.Space]:
     return space.spaces if isinstance(space, gym.spaces.Dict) else {"": space}
-
-
-def _sizes(space: gym.Space) -> Any:
-    """Returns what must be equal for a policy to act in a space, or to read it."""
-    if isinstance(space, gym.spaces.Discrete):
-        return int(space.n)
-    return space.nvec.tolist() if isinstance(space, gym.spaces.MultiDiscrete) else space.shape
 
 
 def open_arena(task: Task, num_envs: int, in_process: bool | None = None) -> Arena:
@@ -240,11 +234,13 @@ class MultiagentArena:
         while left and not (lived.issuperset(returns) and returns.keys().isdisjoint(left)):
             check_ends(steps, self._task.env_id)
             own = own_observations(observations)
-            actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
-            observations, rewards, terminated, truncated, _ = env.step(env.drive_others(own) | actions)
+            seen = own if is_own(name) else {agent: one for agent, one in own.items() if agent in returns}
+            chosen = {agent: action for agent, action in driver(seen).items() if agent in returns}
+            acting = returns.keys() & left
+            observations, rewards, terminated, truncated, _ = env.step(env.drive_others(own) | chosen)
             left = living(env, terminated, truncated)
             lived.update(left)
-            for agent in returns:
+            for agent in acting:  # some environments go on rewarding agents that have ended
                 returns[agent] += float(rewards.get(agent, 0.0))
             steps += 1
         return _result(seed, steps, returns)

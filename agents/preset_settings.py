@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from agents.presets import PRESETS, Algorithm, Preset
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 from predictor.support.files import write_text
 from predictor.support.reading import NoSuchFile, read_toml
 from predictor.support.typed_values import converted
@@ -60,9 +60,10 @@ def settings_from_words(algorithm: Algorithm, words: Sequence[str]) -> dict[str,
     hints = {field.name: get_type_hints(kind)[field.name] for field in fields(kind)}
     for word in words:
         name, _, text = word.partition("=")
-        if not name or not text:
+        if not name or not text or "\n" in word:
             raise UserError(
-                f"--set takes NAME=VALUE with hyperparameters of {algorithm} ({', '.join(hints)}), got '{word}'"
+                f"--set takes NAME=VALUE with hyperparameters of {algorithm} ({', '.join(hints)}), got "
+                f"{short(repr(word), 80)}"
             )
         table[name] = _value(text, is_array=hints.get(name) == tuple[int, ...])
     return settings_from_table(algorithm, table, "--set")

@@ -20,6 +20,8 @@ from agents.studies.pool import run_cells
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
 from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
+from envs.registry import envpool_task_of
+from envs.simulators.envpool import begins_alike
 from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
@@ -99,6 +101,9 @@ def run_study(config: StudyConfig) -> int:
         delete_leftovers(folder)
         results = _results_of(folder, cells)
         _keep_file(folder, text)
+        copies = {envpool_task_of(cell.task.env_id) for cell in chosen if cell.task.backend == "envpool"}
+        for task_id in filter(begins_alike, sorted(copies)):
+            print(f"note: EnvPool's {task_id} begins every training episode in the same state; the original does not")
         failed = _run_missing(config, folder, chosen, results, len(cells))
         done = [results[cell.name] for cell in cells if cell.name in results]
         _write(config, folder, study, done, text, [cell for cell, _ in failed], len(cells))

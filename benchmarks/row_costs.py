@@ -70,7 +70,7 @@ def make_run(
     env.reset()
     reader = VmasReader(env)
     worlds = SceneStream(
-        load_forecaster(checkpoint, reader.spec, "VMAS's simple_spread", device), rows, reader.spec.max_agents, config
+        load_forecaster(checkpoint, reader.spec, "VMAS's simple_spread", device), reader.spec, rows, config
     )
     return lambda: env.step([env.get_random_action(agent) for agent in env.agents]), lambda: worlds.take(
         reader.read(env, envs)

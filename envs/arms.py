@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from predictor.forecaster import Forecaster, has_scale
 from predictor.support.config_checks import check_choice
 from predictor.support.errors import UserError
+from predictor.support.typed_values import from_table
 
 PRESENT_KEYS = ("agents", "valid", "ego_path")
 """Entries on the present and on the ego itself, which every arm shows."""
@@ -113,12 +114,17 @@ class EntryBank:
         return drawn
 
 
-def arm_of(arm: "Arm | None") -> "Arm":
+def arm_of(arm: "Arm | Mapping[str, Any] | None") -> "Arm":
     """Returns an arm; for None, the one that shows all of a forecast.
+
+    Args:
+        arm: an arm, or its fields as an `EnvSpec` in JSON has them.
 
     Raises:
         UserError: it is something else.
     """
+    if isinstance(arm, Mapping):
+        return from_table(Arm, arm, "arm")
     if arm is not None and not isinstance(arm, Arm):
         raise UserError(f"arm must be an Arm, for example Arm('zeros') of envs.arms, got {arm!r}")
     return Arm() if arm is None else arm

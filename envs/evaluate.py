@@ -326,7 +326,7 @@ def _settings(config: EvaluateConfig, env_id: str, driver: str) -> dict[str, Any
 def _measure_all(
     config: EvaluateConfig, console: Console, name: str, runs: Sequence[Any], measure: Any, reports: Any
 ) -> None:
-    """Measures each run, prints it, and writes NAME.json, NAME.md and figures.
+    """Measures each run, prints it, and writes NAME.json, NAME.md and figures, anew after each run: the next may fail.
 
     Args:
         config: settings of the command.
@@ -342,9 +342,9 @@ def _measure_all(
         console.print(reports.shown(results[-1]))
         for remark in reports.remarks(results[-1]):
             console.print(remark, markup=False)
-        if config.out is not None:
-            reports.write_picture(config.out, results[-1])
-    if config.out is not None:
+        if config.out is None:
+            continue
+        reports.write_picture(config.out, results[-1])
         content = {"config": asdict(config), "results": [reports.as_json(result) for result in results]}
         write_json(config.out / f"{name}.json", finite(content | {"provenance": provenance(PACKAGES)}))
         write_text(config.out / f"{name}.md", reports.markdown(results))
@@ -363,7 +363,7 @@ def main() -> None:
         driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
         world = open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs)
         world.close()
-        if not causes and len(config.checkpoint) < 2:  # what does not fit is an error; of several, it is noted
+        if len(config.checkpoint) < 2:  # what does not fit is an error; of several, it is noted
             chosen = config.checkpoint[0] if config.checkpoint else checkpoint_for(env_id)
             load_forecaster(chosen, world.spec, f"env '{env_id}'")
     for checkpoint in config.checkpoint:

@@ -21,7 +21,7 @@ from envs.entries import ego_entries, entry_spaces, path_entries
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.forecaster import Forecaster
-from predictor.scene import PADDING_ID, Forecast, SceneBatch, SceneSpec, perceived_agents
+from predictor.scene import Forecast, SceneBatch, SceneSpec, perceived_agents
 from predictor.support.errors import UserError, short
 
 Entries = dict[str, NDArray[np.float32]]
@@ -71,15 +71,12 @@ class MultiagentStream(SceneStream):
                 "multiagent scenes need has_ego=False and positions on two axes, got "
                 f"has_ego={scene_spec.has_ego} and {scene_spec.position_dim} axes; change the reader's spec"
             )
-        self.scene_spec = scene_spec
         self.view_spec = replace(
             scene_spec,
             perception_m=scene_spec.perception_m if perception_m is None else perception_m,
             max_agents=scene_spec.max_agents if max_agents is None else max_agents,
         )
-        # A forecaster with an ego gets an ego that is not valid at index 0.
-        self._front = int(forecaster.spec.has_ego)
-        super().__init__(forecaster, envs, scene_spec.max_agents + self._front, config)
+        super().__init__(forecaster, scene_spec, envs, config)
         self._spaces = self.spaces()
 
     def spaces(self) -> dict[str, gym.Space]:
@@ -114,18 +111,6 @@ class MultiagentStream(SceneStream):
             forecast = _as_told(scenes, forecast)
         fill = None if arm.changes_nothing else functools.partial(arm.filled, spaces=self._spaces)
         return view_entries(scenes, forecast, self.view_spec, self.config.shows_uncertainty, fill)
-
-    def _given(self, scenes: SceneBatch) -> SceneBatch:
-        front = (0, 0), (self._front, 0)
-        return SceneBatch(
-            np.pad(scenes.states, (*front, (0, 0))),
-            np.pad(scenes.ids, front, constant_values=PADDING_ID),
-            np.pad(scenes.valid, front),
-            scenes.heading_rad,
-        )
-
-    def _shown(self, forecast: Forecast) -> Forecast:
-        return forecast.without_first(self._front)
 
 
 def _as_told(scenes: Sequence[MultiagentScene], like: Forecast) -> Forecast:

@@ -116,18 +116,21 @@ class ForecastStream(SceneStream):
         config: settings of the forecast.
 
     Attributes:
-        planned: latest forecast for plans, with an axis of plans; None before the first.
+        planned: latest forecast for plans, with an axis of plans, of the environments whose scenes were taken in last;
+            where an episode just ended, of the scene that opens the next one. None before the first.
 
     Raises:
-        UserError: scenes that do not lie in a plane.
+        UserError: scenes without an ego, or that do not lie in a plane.
     """
 
     def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, envs: int, config: ForecastConfig) -> None:
         """Starts with empty memory."""
-        if scene_spec.position_dim != 2:
-            raise UserError(f"observations need positions in a plane, got {scene_spec.position_dim} axes")
-        super().__init__(forecaster, envs, scene_spec.max_agents, config)
-        self.scene_spec = scene_spec
+        if not scene_spec.has_ego or scene_spec.position_dim != 2:
+            raise UserError(
+                "observations need scenes with an ego and positions in a plane, got "
+                f"has_ego={scene_spec.has_ego} and {scene_spec.position_dim} axes; SceneStream forecasts others"
+            )
+        super().__init__(forecaster, scene_spec, envs, config)
         self.planned: Forecast | None = None
         self._spaces = self.spaces()
 
@@ -157,7 +160,10 @@ class ForecastStream(SceneStream):
         Plans are those of the scenes, then those of the successors; `seeds` are those of `take_boundary`.
         """
         forecast = self.take_boundary(scenes, ended, successors, seeds)
-        return self._entries(SceneBatch.concatenate(scenes, successors), forecast, plans)
+        entries = self._entries(SceneBatch.concatenate(scenes, successors), forecast, plans)
+        if plans is not None and self.planned is not None:
+            self.planned = self._of_envs(self.planned)
+        return entries
 
     def _entries(
         self, scenes: SceneBatch, forecast: Forecast, plans: PlanBatch | None

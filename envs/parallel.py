@@ -192,8 +192,10 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
             self._unchecked.remove("reset")
         self._reader.reset()
         self._last_actions = {}
-        inside = getattr(self.env.unwrapped, "agents", observations)  # a wrapper may show agents that are not there yet
-        scene = self._read(observations, [agent for agent in observations if agent in inside])
+        # a wrapper may show agents that are not there yet, but none of a name that the environment does not have
+        inside = getattr(self.env.unwrapped, "agents", observations)
+        possible = getattr(self.env.unwrapped, "possible_agents", observations)
+        scene = self._read(observations, [agent for agent in observations if agent in inside or agent not in possible])
         shown = self._own(observations)
         if self._forward is not None:
             self._forward.begin(self._place, scene, shown, seed)

@@ -13,7 +13,7 @@ from torch import Tensor
 from envs.arms import Arm
 from predictor.forecaster import Forecaster
 from predictor.online import MAX_ROWS, Chosen, OnlineForecaster
-from predictor.scene import Forecast, SceneBatch
+from predictor.scene import PADDING_ID, Forecast, SceneBatch, SceneSpec
 from predictor.scene_checks import MOST_STEPS, chosen_envs
 from predictor.support.config_checks import check_at_least, check_at_most, check_types
 from predictor.support.errors import ProtocolError, UserError, short
@@ -75,12 +75,13 @@ class SceneStream:
     A deep copy or a pickle continues exactly; a deep copy shares the forecaster, which no step changes.
 
     Args:
-        forecaster: forecaster on `config.device`.
+        forecaster: forecaster on `config.device`; one with an ego gets an absent one where the scenes have none.
+        scene_spec: layout of the scenes that will arrive.
         envs: number of parallel environments.
-        agents: number of agents of each scene, padding included.
         config: settings of the forecast.
 
     Attributes:
+        scene_spec: layout of the scenes.
         config: settings of the forecast.
         horizon_steps: number of steps of a forecast.
         scenes: latest scene of each environment; None before the first. Where an episode just ended, the one that
@@ -89,13 +90,16 @@ class SceneStream:
         seen: scenes that were taken in last; where an episode just ended, its last.
     """
 
-    def __init__(self, forecaster: Forecaster, envs: int, agents: int, config: ForecastConfig) -> None:
+    def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, envs: int, config: ForecastConfig) -> None:
         """Starts with empty memory."""
+        self.scene_spec = scene_spec
         self.config = config
         self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
         self.scenes: SceneBatch | None = None
         self.forecast: Forecast | None = None
         self.seen: SceneBatch | None = None
+        self._front = int(forecaster.spec.has_ego and not scene_spec.has_ego)
+        agents = self._front + scene_spec.max_agents
         self._online = OnlineForecaster(forecaster, envs, agents, config.device, config.max_rows)
         self._noise = EnvNoise([config.seed + env for env in range(envs)])
         self._before: Sequence[np.random.Generator] = self._noise
@@ -206,10 +210,15 @@ class SceneStream:
         forecast = self._forecast_for(self._noise.over(ended, seeds))
         kept = np.arange(len(scenes))
         kept[ended] = len(scenes) + np.arange(len(ended))
-        index = torch.from_numpy(kept).to(forecast.xy.device)
         self.scenes, self.seen = SceneBatch.concatenate(scenes, successors)[kept], scenes
-        self.forecast, self._rows = _changed(lambda field: field[index], forecast), kept
+        self._rows = kept
+        self.forecast = self._of_envs(forecast)
         return forecast
+
+    def _of_envs(self, forecast: Forecast) -> Forecast:
+        """Returns a forecast of all scenes that were taken in last as one of each environment's latest."""
+        index = torch.from_numpy(self._rows).to(forecast.xy.device)
+        return _changed(lambda field: field[index], forecast)
 
     def _latest(self, num_samples: int, noise: Sequence[np.random.Generator]) -> Forecast:
         """Returns a forecast of the latest scene of each environment; closing scenes draw from a noise of their own."""
@@ -220,9 +229,7 @@ class SceneStream:
             return self._shown(self._online.forecast(self.horizon_steps, num_samples, noise))
         of_row = {int(row): noise[env] for env, row in enumerate(self._rows)}
         drawn = [of_row.get(row) or np.random.default_rng(row) for row in range(rows)]
-        forecast = self._shown(self._online.forecast(self.horizon_steps, num_samples, drawn))
-        index = torch.from_numpy(self._rows).to(forecast.xy.device)
-        return _changed(lambda field: field[index], forecast)
+        return self._of_envs(self._shown(self._online.forecast(self.horizon_steps, num_samples, drawn)))
 
     def _forecast_for(self, noise: Sequence[np.random.Generator]) -> Forecast:
         """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""
@@ -231,11 +238,19 @@ class SceneStream:
 
     def _given(self, scenes: SceneBatch) -> SceneBatch:
         """Returns the scenes in the layout of the forecaster."""
-        return scenes
+        if not self._front:
+            return scenes
+        front = (0, 0), (self._front, 0)
+        return SceneBatch(
+            np.pad(scenes.states, (*front, (0, 0))),
+            np.pad(scenes.ids, front, constant_values=PADDING_ID),
+            np.pad(scenes.valid, front),
+            scenes.heading_rad,
+        )
 
     def _shown(self, forecast: Forecast) -> Forecast:
         """Returns the forecast in the layout of the scenes that were given."""
-        return forecast
+        return forecast.without_first(self._front)
 
     def _keep_some(self, scenes: SceneBatch, forecast: Forecast, envs: Int[np.ndarray, " some"]) -> None:
         count, index = len(self._noise), torch.from_numpy(np.asarray(envs, dtype=np.int64)).to(forecast.xy.device)

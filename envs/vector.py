@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers.vector import DictInfoToList
 
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
@@ -88,6 +89,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         require_kind(env, VECTOR, "VectorForecast")
         gym.vector.VectorWrapper.__init__(self, env)
         refuse_reader(reader, "VectorForecast")
+        _refuse_lists(env)
         space = require_scenes(env.single_observation_space, "VectorForecast")
         spec: SceneSpec = common_value(_attribute_of_each(env, "scene_spec"), "scene spec")
         source: str = common_value(_attribute_of_each(env, "scene_source"), "env id")
@@ -167,6 +169,14 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         del infos[PLANS_INFO]
         infos.pop(f"_{PLANS_INFO}", None)
         return plans
+
+
+def _refuse_lists(env: gym.vector.VectorEnv) -> None:
+    """Raises a `UserError` if a wrapper makes a list of the infos, in which no last observation is found."""
+    while isinstance(env, gym.vector.VectorWrapper):
+        if isinstance(env, DictInfoToList):
+            raise UserError("VectorForecast reads infos as a dict; put DictInfoToList around it, not inside")
+        env = env.env
 
 
 def _attribute_of_each(env: gym.vector.VectorEnv, name: str) -> Any:

@@ -141,8 +141,22 @@ class Belief:
 
 
 def has_scale(forecaster: "Forecaster") -> bool:
-    """Returns whether roll-outs of a forecaster come with `Futures.scale`."""
+    """Returns whether roll-outs of a forecaster come with `Futures.scale`: its attribute `has_scale`, if it has one."""
     return bool(getattr(forecaster, "has_scale", False))
+
+
+def check_scale(futures: "Futures", forecaster: "Forecaster") -> None:
+    """Checks that futures come with a scale if, and only if, the forecaster says so.
+
+    Raises:
+        UserError: they do not.
+    """
+    if (futures.scale is not None) != has_scale(forecaster):
+        found, wanted = ("no scale", "False") if futures.scale is None else ("a scale", "True")
+        raise UserError(
+            f"rollout of a forecaster gave {found}, and its has_scale is {has_scale(forecaster)}; set has_scale = "
+            f"{wanted}, which sizes observations"
+        )
 
 
 def edgeless_belief(

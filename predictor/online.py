@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_futures, check_observed
+from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_futures, check_observed, check_scale
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise, check_noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
@@ -230,6 +230,7 @@ class OnlineForecaster:
             check_futures(futures, steps, num_samples, belief.states, self.forecaster.spec.position_dim)
         else:
             futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
+        check_scale(futures, self.forecaster)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from predictor.forecaster import Belief, Futures, Memory, check_futures, require_forecaster
+from predictor.forecaster import Belief, Futures, Memory, check_futures, check_scale, require_forecaster
 from predictor.forecaster_trial import AGENTS, SAMPLES, SCENES, STEPS, Trial
 from predictor.support.errors import UserError
 from predictor.what_if import ReactiveForecaster
@@ -161,6 +161,10 @@ def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: Trial) -> I
         yield f"rollout: scale must have the shape {shape}, got {tuple(scale.shape)}"
     elif scale is not None and not bool(((scale >= 0) & torch.isfinite(scale))[there].all()):
         yield "rollout: scale is a standard deviation [m]; it must be finite and not negative"
+    try:
+        check_scale(futures, trial.forecaster)
+    except UserError as error:
+        yield str(error)
 
 
 # --- Meaning ----------------------------------------------------------------------------------------------------------

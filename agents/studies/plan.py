@@ -17,6 +17,7 @@ from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, is_planner
 from envs.registry import entry_for, is_multiagent_id
 from envs.sb3.algorithms import algorithm_named
+from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.own_forecasters import is_own
 from predictor.support.config_checks import check_at_least, check_at_most, check_choices
 from predictor.support.errors import UserError
@@ -254,7 +255,8 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     if arm.observe in NO_CHECKPOINT:
         shared.pop("checkpoint", None)
     own = {**shared, **options}.get("checkpoint")
-    if not is_own(sizes_of) and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
+    has_sizes = not is_own(sizes_of) and sizes_of != CONSTANT_VELOCITY
+    if has_sizes and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
         shared.setdefault("sizes_of", sizes_of)
     if arm.observe == "none":
         shared = {key: value for key, value in shared.items() if key not in _OF_FORECASTS}

@@ -102,7 +102,7 @@ def planner_driver(name: str, env: gym.Env, rng: np.random.Generator) -> "Planne
         UserError: no plan model or no checkpoint fits the environment, or the bound is none.
     """
     checkpoint, config = planner_checkpoint(name), planner_config(name)
-    model = _model_of_actions(env)
+    model = plan_model_for(env)
     if checkpoint == ORACLE:
         forecaster = forecaster_for(env, entry_for(scene_source(env)).checkpoint or CONSTANT_VELOCITY)
         return Planner(env, forecaster, model, rng, replace(config, true_futures=True))
@@ -132,19 +132,6 @@ def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:
 @functools.lru_cache(maxsize=4)
 def _loaded(checkpoint: str, spec: Any, source: str) -> Forecaster:
     return load_forecaster(checkpoint, spec, f"env '{source}'")
-
-
-def _model_of_actions(env: gym.Env) -> PlanModel:
-    """Returns the environment's plan model, if the actions of its plans are those that the environment takes."""
-    inside: gym.Env = env
-    while isinstance(inside, gym.Wrapper):
-        if isinstance(inside, gym.ActionWrapper) and not isinstance(inside, gym.wrappers.ClipAction):
-            raise UserError(
-                f"plans begin with actions of the environment itself, which {type(inside).__name__} changes; give the "
-                "planner the environment without it, or a plan model of your own whose actions are those outside"
-            )
-        inside = inside.env
-    return plan_model_for(env)
 
 
 class Planner:
@@ -178,7 +165,7 @@ class Planner:
         """Starts with an empty history."""
         self.config = config or PlannerConfig()
         self.env = env
-        self.plan_model = plan_model or _model_of_actions(env)
+        self.plan_model = plan_model or plan_model_for(env)
         trained = forecaster.spec
         self._own_reader = not env.has_wrapper_attr("scene_spec")
         self._reader: SceneReader = (

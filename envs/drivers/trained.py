@@ -77,7 +77,7 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     """Returns the env with the observations of a driver: with forecasts for a policy trained on them, else as it is.
 
     Raises:
-        UserError: no such policy, or one that was trained on other observations.
+        UserError: no such policy, or one that was trained on other observations or actions.
     """
     if not name.endswith(".zip"):
         return env
@@ -147,25 +147,26 @@ def wrapper_options(path: str) -> dict[str, Any]:
 
 
 def require_view(env: gym.Env, name: str) -> None:
-    """Raises a `UserError` if the driver is a policy that was trained on other observations than the env's."""
-    _require_space(env.observation_space, name)
+    """Raises a `UserError` if the driver is a policy of other observations or actions than the env's."""
+    _require_spaces(env.observation_space, env.action_space, name)
 
 
 def require_own_view(env: gym.Env, name: str) -> None:
     """Raises a `UserError` if the driver is a policy that does not drive by the environment's own observation."""
     if sees_forecasts(name):
         raise UserError(f"policy {name} sees forecasts, which a driver is not shown; measure it with --run-dir {name}")
-    _require_space(space_without_added(env.observation_space), name)
+    _require_spaces(space_without_added(env.observation_space), env.action_space, name)
 
 
-def _require_space(given: gym.Space, name: str) -> None:
+def _require_spaces(observations: gym.Space, actions: gym.Space, name: str) -> None:
     if not name.endswith(".zip"):
         return
-    from envs.sb3.acting import space_as_stored  # most drivers need no SB3
+    from envs.sb3.acting import require_actions, space_as_stored  # most drivers need no SB3
 
-    wanted = kept_policy(name).observation_space
-    if space_as_stored(given) != wanted:
-        raise UserError(f"policy {name} was trained on {wanted}, but the env gives {given}")
+    policy = kept_policy(name)
+    if space_as_stored(observations) != policy.observation_space:
+        raise UserError(f"policy {name} was trained on {policy.observation_space}, but the env gives {observations}")
+    require_actions(policy, actions, f"policy {name}")
 
 
 def sees_forecasts(name: str) -> bool:

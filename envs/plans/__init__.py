@@ -48,8 +48,17 @@ def plan_model_for(env: gym.Env) -> PlanModel:
     """Returns the plan model of an environment: the one registered for its class, or highway-env's.
 
     Raises:
-        UserError: there is none for the environment or its actions.
+        UserError: there is none for the environment or its actions, or a wrapper changes its actions.
     """
+    inside: gym.Env = env
+    while isinstance(inside, gym.Wrapper):
+        if isinstance(inside, gym.ActionWrapper) and not isinstance(inside, gym.wrappers.ClipAction):
+            name = type(inside).__name__
+            raise UserError(
+                f"plans are made of actions of the environment itself, which {name} changes; put {name} around what "
+                "needs plans, or pass a plan model of your own whose actions are those outside"
+            )
+        inside = inside.env
     for kind in type(env.unwrapped).__mro__:
         if kind in _REGISTERED:
             return checked_model(_REGISTERED[kind](env))

@@ -69,6 +69,23 @@ class HighwayReader(Reader):
         """Forgets all identities; numbering starts anew, so equal seeds give equal ids."""
         self._ids: IdentityDict[int] = IdentityDict()
         self._next_id = 0
+        self._read_at_s: float | None = None
+
+    def read(self, env: gym.Env) -> Scene:
+        """Returns what the ego perceives, padded to `max_agents`.
+
+        Raises:
+            UserError: since the scene before, neither a time step has passed nor none.
+        """
+        now_s = float(env.unwrapped.time)  # type: ignore[attr-defined]
+        passed_s = now_s - (now_s if self._read_at_s is None else self._read_at_s)
+        if min(abs(passed_s), abs(passed_s - self._spec.dt_s)) > 1e-6 * max(1.0, now_s):
+            raise UserError(
+                f"the env was wrapped at dt_s={self._spec.dt_s:g} but {passed_s:g} s passed between two scenes; put a "
+                "wrapper that repeats steps around this one, not inside, or set policy_frequency instead"
+            )
+        self._read_at_s = now_s
+        return super().read(env)
 
     def read_all(self, env: gym.Env) -> Scene:
         """Returns every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""

@@ -60,15 +60,17 @@ def _module_path(cls: type) -> tuple[str, str]:
 def agents_in_sight(env: Any) -> Sequence[str]:
     """Returns names of the agents that are observed: those that live, or all of them after an episode's last step.
 
-    The last observation of an agent shows its last position, although PettingZoo counts no agent as living by then.
+    The last observation of an agent shows its last position, although PettingZoo counts no agent as living by then, and
+    a wrapper that ends an agent alone does not count it either.
 
     Raises:
         ProtocolError: before the first reset.
     """
-    living: Sequence[str] | None = getattr(env, "agents", None)
+    inside = env.unwrapped
+    living: Sequence[str] | None = getattr(inside, "agents", None)
     if living is None:
         raise ProtocolError("the environment has no agents yet; call reset() first")
-    return living or env.possible_agents
+    return living or inside.possible_agents
 
 
 @dataclass(frozen=True)

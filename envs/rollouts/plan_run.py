@@ -74,7 +74,7 @@ class EnvPlans:
     horizon_steps: int
     """Number of steps forecast and played."""
     episodes: int
-    """Number of episodes played."""
+    """Number of episodes with a moment, of those that were played."""
     plan_names: tuple[str, ...]
     """Name of each plan."""
     moments: int

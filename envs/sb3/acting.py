@@ -12,7 +12,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.vec_env import VecTransposeImage
 
 from envs.own_observation import carries_forecasts, space_without_added, without_added
-from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of, shared_action
 from predictor.support.errors import UserError
 
 
@@ -70,7 +70,7 @@ class ActingTeam:
         actions: own action space of each learner, by name.
 
     Raises:
-        UserError: a name is unknown, or the policy was trained on other observations.
+        UserError: a name is unknown, or the policy was trained on other observations or actions.
     """
 
     def __init__(self, policy: BaseAlgorithm, env: Any, names: Sequence[str], source: str) -> None:
@@ -83,6 +83,7 @@ class ActingTeam:
         self._padded = PaddedObservation(spaces, roles_of(spaces, self.actions), None)
         if space_as_stored(self._padded.space) != wanted:
             raise UserError(f"{source} was trained on {_line(wanted)}, but the env gives {_line(self._padded.space)}")
+        require_actions(policy, shared_action(self.actions), source)
         self._fresh = ActingPolicy(policy)
         self._acting: dict[str, ActingPolicy] = {}
 
@@ -104,6 +105,20 @@ class ActingTeam:
 
     def _seen_space(self, space: gym.Space) -> gym.Space:
         return space_without_added(space) if self._strips else space
+
+
+def require_actions(policy: BaseAlgorithm, space: gym.Space, source: str) -> None:
+    """Raises a `UserError` if a policy, called `source` in the message, was trained with actions of other sizes."""
+    trained: gym.Space = policy.action_space
+    if sizes_of_space(trained) != sizes_of_space(space):
+        raise UserError(f"{source} was trained with the actions {_line(trained)}, but the env takes {_line(space)}")
+
+
+def sizes_of_space(space: gym.Space) -> Any:
+    """Returns what must be equal for a policy to act in a space, or to read it."""
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.n)
+    return space.nvec.tolist() if isinstance(space, gym.spaces.MultiDiscrete) else space.shape
 
 
 def space_as_stored(space: gym.Space) -> gym.Space:

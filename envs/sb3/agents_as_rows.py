@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from envs.batched_forward import collected
 from envs.parallel import batch_forwards, living
+from envs.sb3.copies import with_notes, without_notes
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from envs.sb3.partners import Partner, chosen_partner
 from envs.seeding import driver_rng
@@ -212,6 +213,14 @@ class AgentMonitor(VecMonitor):
 
     It takes VecMonitor's arguments, and `evaluate_policy` uses its counts.
     """
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state of a copy or a pickle."""
+        return without_notes(vars(self))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a copy or a pickle."""
+        self.__dict__.update(with_notes(type(self), state))
 
     def step_wait(self) -> VecEnvStepReturn:
         """Steps; each life that ended gets `info["episode"]` with its return r, length l and time t [s]."""

@@ -5,7 +5,6 @@ observation that closes an episode carries the forecast made from that episode's
 starts from one step. `envs.vector` serves gymnasium's vector environments.
 """
 
-import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,10 @@ from envs.own_observation import own_part
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
+from envs.sb3.copies import with_notes, without_notes
 from envs.scene_stream import NOISE_SEED_INFO, ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch
-
-_CLASS_NOTES = "class_attributes"
 
 
 class VecForecast(ForecastWrapper, VecEnvWrapper):
@@ -101,11 +99,11 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state of a copy or a pickle, without VecEnvWrapper's notes on its class, which do not pickle."""
-        return {name: value for name, value in super().__getstate__().items() if name != _CLASS_NOTES}
+        return without_notes(super().__getstate__())
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores a copy or a pickle."""
-        super().__setstate__({**state, _CLASS_NOTES: dict(inspect.getmembers(type(self)))})
+        super().__setstate__(with_notes(type(self), state))
 
     @property
     def scene(self) -> SceneBatch:

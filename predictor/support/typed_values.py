@@ -93,10 +93,11 @@ def _tuple(value: Any, kinds: tuple[Any, ...], where: str) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
         raise UserError(f"{where} must be an array, got {_shown(value)}")
     if len(kinds) == 2 and kinds[1] is Ellipsis:
-        return tuple(converted(entry, kinds[0], where) for entry in value)
+        return tuple(converted(entry, kinds[0], f"{where}[{i}]") for i, entry in enumerate(value))
     if len(value) != len(kinds):
         raise UserError(f"{where} must have {len(kinds)} entries, got {len(value)}")
-    return tuple(converted(entry, kind, where) for entry, kind in zip(value, kinds, strict=True))
+    each = enumerate(zip(value, kinds, strict=True))
+    return tuple(converted(entry, kind, f"{where}[{i}]") for i, (entry, kind) in each)
 
 
 def _shown(value: Any) -> str:
@@ -112,5 +113,7 @@ def _one_of(value: Any, kinds: list[Any], where: str) -> Any:
         except UserError as error:
             if len(kinds) == 1:
                 raise
+            if isinstance(value, list | dict) and not str(error).startswith(f"{where} must be "):
+                raise  # the value is of this type, and what it holds is not
             wanted.append(str(error).removeprefix(f"{where} must be ").rpartition(", got ")[0])
     raise UserError(f"{where} must be {' or '.join(wanted)}, got {_shown(value)}")

@@ -1,9 +1,10 @@
 import json
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -37,6 +38,75 @@ def test_policies_of_envpool_are_measured_on_the_original(monkeypatch: pytest.Mo
     monkeypatch.setattr("agents.arena.make_venv", note)
     arena = open_arena(Task("highway-fast-v0", "none", backend="envpool"), 1)
     assert asked == [(Task("highway-fast-v0", "none"), 1, True)]
+    arena.close()
+
+
+class GoesOnPaying(ParallelEnv):
+    """Pays each agent 1 per step, also those that have ended: "a_0" at step 2, "a_1" at step 10."""
+
+    metadata: ClassVar = {"name": "pays", "render_modes": []}
+    render_mode = None
+    possible_agents: ClassVar = ["a_0", "a_1"]
+
+    def observation_space(self, agent: str) -> gym.Space:
+        return gym.spaces.Box(-1, 1, (3,), np.float32)
+
+    def action_space(self, agent: str) -> gym.Space:
+        return gym.spaces.Discrete(2)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents, self.t = list(self.possible_agents), 0
+        return {agent: np.zeros(3, np.float32) for agent in self.agents}, {agent: {} for agent in self.agents}
+
+    def step(self, actions: Any) -> Any:
+        self.t += 1
+        ended = {"a_0": self.t >= 2, "a_1": self.t >= 10}
+        each = self.possible_agents
+        seen, rewards = {agent: np.zeros(3, np.float32) for agent in each}, dict.fromkeys(each, 1.0)
+        return seen, rewards, ended, dict.fromkeys(each, False), {agent: {} for agent in each}
+
+
+def parallel_env(**kwargs: Any) -> ParallelEnv:
+    return GoesOnPaying(**kwargs)
+
+
+def test_drivers_get_no_reward_of_agents_that_have_ended():
+    """As policies, which are played by other code."""
+    task = Task(f"{__name__}:GoesOnPaying", "none")
+    arena = open_arena(task, 1)
+    model = PPO("MlpPolicy", make_venv(task, 1), n_steps=4, batch_size=4)
+    for policy in (model, "random", "idle"):
+        (result,) = arena.play(policy, [5])
+        assert (result.episode_return, result.length) == ((2 + 10) / 2, 10), policy
+    arena.close()
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_driver_of_ones_own_sees_all_agents_and_moves_the_learners(obeys: bool, monkeypatch: pytest.MonkeyPatch):
+    """Also where it gives an action for each agent that lives, as it is asked to."""
+    seen: list[list[str]] = []
+
+    def make(name: str, env: Any, rng: Any) -> Any:
+        def act(observations: Any) -> Any:
+            seen.append(list(observations))
+            return {agent: 0 for agent in observations if obeys or agent != "agent_0"}
+
+        return act
+
+    moved: list[int] = []
+    arena = open_arena(Task("simple_tag_v3", "none", learners=("adversary",), driver="heuristic"), 1)
+    assert isinstance(arena, MultiagentArena)
+    step = arena._env.step
+
+    def spied(actions: Any) -> Any:
+        moved.append(actions["agent_0"])
+        return step(actions)
+
+    monkeypatch.setattr("agents.arena.make_driver", make)
+    monkeypatch.setattr(arena._env, "step", spied)
+    arena.play("own:module:name", [5])
+    assert seen[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
+    assert set(moved) != {0}  # the heuristic prey's own
     arena.close()
 
 

@@ -62,3 +62,8 @@ def test_bad_files_are_one_clear_line(text: str, message: str, tmp_path: Path):
 def test_an_integer_too_long_for_a_number_is_one_line():
     with pytest.raises(UserError, match="gamma must be a number of at most 308 digits, got one of 401"):
         settings_from_words("ppo", ["gamma=1" + "0" * 400])
+
+
+def test_a_second_line_of_a_word_is_refused():
+    with pytest.raises(UserError, match=r"--set takes NAME=VALUE .*got 'gamma=0.9\\nlearning_rate=1'$"):
+        settings_from_words("ppo", ["gamma=0.9\nlearning_rate=1"])

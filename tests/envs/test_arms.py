@@ -5,10 +5,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 from agents.task import Task
 from envs import ForecastObservation, make_env
-from envs.arms import ARMS, PRESENT_KEYS, Arm, EntryBank, EntryLayout
+from envs.arms import ARMS, PRESENT_KEYS, Arm, EntryBank, EntryLayout, arm_of
 from envs.entry_bank import record_bank
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_multiagent_env
@@ -207,6 +208,17 @@ def test_each_direction_of_edges_keeps_its_place_in_a_larger_layout():
     np.testing.assert_array_equal(found["edge_features"][:, [*range(8), *range(10, 18)]], own["edge_features"])
     assert not found["edge_probs"][:, [1, 3]].any() and not found["edge_features"][:, [8, 9, 18, 19]].any()
     env.close(), plain.close()
+
+
+def test_a_spec_in_json_makes_the_environment_again():
+    env = gym.make("highway-fast-v0")
+    env = ForecastObservation(env, "constant-velocity", arm=Arm("zeros", EntryLayout(2, 3, True)), num_samples=2)
+    assert env.spec is not None
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.observation_space == env.observation_space
+    assert not again.reset(seed=0)[0]["forecast"].any()
+    with pytest.raises(UserError, match="arm: unknown key 'nam'"):
+        arm_of({"nam": "zeros"})
 
 
 def test_an_unknown_arm_is_refused():

@@ -85,6 +85,37 @@ def test_plans_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     assert list(result["scores"]) == [STRAIGHT] and result["moments"] >= 1 and result["horizon_steps"] == 2
 
 
+def test_what_was_measured_is_written_before_another_environment_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    measured = evaluate.measure_plans
+
+    def failing(run: Any) -> Any:
+        if run.env_id == "highway-fast-v0":
+            raise UserError("the simulator died")
+        return measured(run)
+
+    monkeypatch.setattr(evaluate, "measure_plans", failing)
+    out = tmp_path / "results"
+    arguments = ["--plans", "--env-ids", "merge-v1", "highway-fast-v0", "--checkpoint", STILL, "--episodes", "1"]
+    arguments += ["--max-steps", "9", "--horizon-steps", "1", "--workers", "1", "--out", str(out)]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (2, ["error: the simulator died"])
+    assert [result["env_id"] for result in read_json(out / "plans.json")["results"]] == ["merge-v1"]
+    assert "merge-v1" in (out / "plans.md").read_text()
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    monkeypatch.setattr(evaluate, "measure_plans", lambda run: pytest.fail("measured"))
+    arguments = ["--plans", "--env-ids", "merge-v1", "racetrack-v1", "--checkpoint", "merge", "--workers", "1"]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (
+        code == 2 and "checkpoint 'merge' was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2" in errors[0]
+    )
+
+
 @pytest.mark.parametrize(("options", "processes"), [({}, 50), ({"reactions": True}, 300)])
 def test_as_many_processes_are_checked_as_may_start(
     options: dict[str, Any], processes: int, monkeypatch: pytest.MonkeyPatch

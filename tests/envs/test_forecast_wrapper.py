@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pettingzoo import ParallelEnv
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from envs.forecast_wrapper import ForecastWrapper
 from envs.parallel import ForecastParallelEnv
@@ -311,6 +311,21 @@ def test_the_forecaster_a_copy_was_given_is_not_doubled():
     env = single()
     copy = deepcopy(env)
     assert copy._saved_kwargs["forecaster"] is env._saved_kwargs["forecaster"] is env.forecaster
+
+
+@pytest.mark.parametrize("again", [deepcopy, pickled])
+def test_a_copy_around_a_monitor_continues_and_counts(again: Callable[[Any], Any]):
+    def episodes(venv: VecEnv, steps: int) -> list[Any]:
+        infos = [info for _ in range(steps) for info in venv.step(np.ones(ENVS, dtype=int))[3]]
+        return [(info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info]
+
+    env = VecForecast(VecMonitor(VecMonitor(DummyVecEnv([walkers] * ENVS))), forecaster=network())
+    env.seed(0)
+    env.reset()
+    assert not episodes(env, 2)
+    copy = again(env)
+    assert copy.venv is not env.venv and copy.get_attr("t") == env.get_attr("t")
+    assert episodes(copy, EPISODE) == episodes(env, EPISODE) != []
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)

@@ -592,6 +592,23 @@ def test_every_observed_agent_must_be_named_at_the_reset(fault: str):
         env.reset(seed=0)
 
 
+class OtherNames(BaseParallelWrapper):
+    """Calls agents otherwise than the environment, which the reader reads."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        return tuple({f"my {agent}": value for agent, value in of.items()} for of in self.env.reset(seed, options))
+
+    def observation_space(self, agent: str) -> gym.Space:
+        return self.env.observation_space(agent.removeprefix("my "))
+
+
+@pytest.mark.unchecked
+def test_a_wrapper_that_renames_agents_needs_a_reader_that_knows_the_names():
+    env = ForecastParallelEnv(OtherNames(Toy()), "constant-velocity", reader=ToyReader)
+    with pytest.raises(UserError, match=r"index_of must have .*lacks \['my stays', 'my dies'\]"):
+        env.reset(seed=0)
+
+
 def test_one_that_is_no_longer_named_has_entries_of_zeros():
     """As one that an intervention has taken out."""
 

@@ -1,14 +1,16 @@
 """What all streams keep apart: the noise, history and latest forecast of each environment."""
 
 from copy import deepcopy
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from envs.observation import ForecastStream
-from envs.scene_stream import ForecastConfig
+from envs.plans.batch import PlanBatch
+from envs.scene_stream import ForecastConfig, SceneStream
+from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import Forecast, SceneBatch
 from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import HIGHWAY_SPEC, PLURAL, assert_same, random_scenes, tiny_model
@@ -227,6 +229,40 @@ def test_over_a_boundary_forecasting_again_is_of_the_new_episodes(make: Any):
                 alone.observe(scenes(2, 2)[np.array([1])])
             alone.pictured(3)
             assert_same(again.xy[env : env + 1].numpy(), alone.again(3).xy.numpy())
+
+
+def test_without_an_ego_no_agent_is_taken_for_it():
+    """A forecaster with an ego gets one that is absent: no agent is its origin, and none is left out."""
+    layout = replace(HIGHWAY_SPEC, has_ego=False, frame=("world", "world"))
+    forecaster = ConstantVelocity(replace(layout, has_ego=True))
+    found = SceneStream(forecaster, layout, ENVS, ForecastConfig()).take(scenes(0))
+    expected = scenes(0).states[:, :, :2] + layout.dt_s * scenes(0).states[:, :, 2:4]
+    there = scenes(0).valid
+    np.testing.assert_allclose(found.xy[:, 0, :, 0].numpy()[there], expected[there], rtol=1e-4)
+    with pytest.raises(UserError, match="observations need scenes with an ego and positions in a plane, got has_ego=F"):
+        ForecastStream(forecaster, layout, ENVS, ForecastConfig())
+
+
+def test_over_a_boundary_plans_are_those_of_the_new_episode():
+    config = ForecastConfig(num_plans=2)
+    made = ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, ENVS, config)
+    first, last, opening = scenes(0), scenes(1), scenes(2, 1)
+    made.observe(first, plans=plans_of(first))
+    assert made.planned is not None and len(made.planned.xy) == ENVS
+    made.observe_boundary(last, np.array([1]), opening, plans_of(SceneBatch.concatenate(last, opening)))
+    alone = ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, 1, config)
+    alone.observe(opening, plans=plans_of(opening))
+    assert alone.planned is not None and len(made.planned.xy) == ENVS
+    assert_same(made.planned.xy[1].numpy(), alone.planned.xy[0].numpy())
+
+
+def plans_of(batch: SceneBatch) -> PlanBatch:
+    """Two plans of each ego: it keeps its velocity, or stands."""
+    horizon = tiny_model(HIGHWAY_SPEC).horizon_steps
+    states = np.repeat(np.repeat(batch.states[:, None, None, 0], horizon, axis=2), 2, axis=1)
+    states[:, 0, :, :2] += np.arange(1, horizon + 1)[:, None] * states[:, 0, :, 2:4] * HIGHWAY_SPEC.dt_s
+    states[:, 1, :, 2:4] = 0.0
+    return PlanBatch(states, np.full((len(batch), 2), 5.0))
 
 
 def test_where_some_environments_came_alone_nothing_is_forecast_again():

@@ -23,8 +23,10 @@ from envs.scene_stream import ForecastConfig
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.forecaster import Forecaster
+from predictor.forecaster import Forecaster, Futures
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
+from predictor.testing import forecaster_problems
 from tests.envs.helpers import (
     HIGHWAY_SPEC,
     HORIZON,
@@ -190,6 +192,29 @@ def test_entries_are_there_with_several_samples_or_on_request(kind: str, samples
         assert spaces["xy_scale"].shape == (others, *axis, HORIZON, 2)
         assert not spaces["xy_scale"].contains(np.full((others, *axis, HORIZON, 2), -0.1, np.float32))
         assert (entries["xy_scale"][entries["valid"] == 1] > 0).all()
+
+
+class Undeclared(ConstantVelocity):
+    """Returns a scale, or says that it does."""
+
+    def __init__(self, says: bool, gives: bool) -> None:
+        super().__init__(HIGHWAY_SPEC, HORIZON)
+        self.has_scale, self.gives = says, gives
+
+    def rollout(self, *args: Any, **kwargs: Any) -> Futures:
+        futures = super().rollout(*args, **kwargs)
+        return futures._replace(scale=torch.ones_like(futures.states[..., :2])) if self.gives else futures
+
+
+@pytest.mark.parametrize(("says", "given"), [(False, "a scale"), (True, "no scale")])
+def test_a_forecaster_must_say_whether_it_has_a_scale(says: bool, given: str):
+    forecaster = Undeclared(says, gives=not says)
+    message = f"rollout of a forecaster gave {given}, and its has_scale is {says}; set has_scale = {not says}"
+    stream = ForecastStream(forecaster, HIGHWAY_SPEC, 1, ForecastConfig(num_samples=3))
+    with pytest.raises(UserError, match=message):
+        stream.observe(random_scenes(np.random.default_rng(0), 1, HIGHWAY_SPEC.max_agents, present=[4]))
+    assert any(message in problem for problem in forecaster_problems(forecaster))
+    assert not forecaster_problems(Undeclared(not says, gives=not says))
 
 
 @pytest.mark.parametrize("uncertainty", [None, False])

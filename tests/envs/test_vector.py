@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
@@ -455,6 +455,11 @@ def test_a_wrapper_below_changes_nothing(mode: AutoresetMode, kind: Any, highway
         assert episodes
     finally:
         env.close()
+
+
+def test_infos_as_a_list_are_for_outside():
+    with pytest.raises(UserError, match="reads infos as a dict; put DictInfoToList around it, not inside"):
+        VectorForecast(DictInfoToList(SyncVectorEnv(MAKERS)), "constant-velocity")
 
 
 def test_a_vector_environment_without_get_attr_is_named():

@@ -96,7 +96,7 @@ def test_card_without_its_accuracy_is_refused(config: CardConfig, content: Any, 
         ({"model": {"min_ade_m": "abc", "min_fde_m": 2.5}}, "min_ade_m must be a number, got 'abc'"),
         ({"driver": 5}, "driver must be a text, got 5"),
         ({"reduction_interval": [1]}, "below_cv_interval must have 2 entries, got 1"),
-        ({"model_samples": ROW["model_samples"] | {"coverage": ["a"]}}, "coverage must be a number, got 'a'"),
+        ({"model_samples": ROW["model_samples"] | {"coverage": ["a"]}}, r"coverage\[0\] must be a number, got 'a'"),
     ],
 )
 def test_figures_of_another_type_are_refused(config: CardConfig, changes: dict[str, Any], shown: str):

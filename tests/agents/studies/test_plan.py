@@ -61,6 +61,14 @@ def test_a_checkpoint_of_a_scenario_goes_to_every_arm_that_takes_one(tmp_path: P
     assert task.checkpoint == (None if arm in ("none", "constant-velocity") else "shared")
 
 
+def test_constant_velocity_as_checkpoint_of_a_scenario_gives_no_sizes(tmp_path: Path):
+    text = study_text(arms='["zeros", "forecast"]')
+    own = 'env_id = "merge-v1"\ncheckpoint = "constant-velocity"\n'
+    study = read_study(study_path(tmp_path, text.replace(text[text.rindex("env_id") :], own)))
+    tasks = [task_for(study.scenarios[0], arm, "file") for arm in study.arms]
+    assert [(task.checkpoint, task.sizes_of) for task in tasks] == [("constant-velocity", None)] * 2
+
+
 def test_arms_with_forecasters_of_their_own_have_the_sizes_of_the_others(tmp_path: Path):
     arms = '["zeros", "forecast", {name = "mine", observe = "forecast", checkpoint = "runs/mine"}]'
     study = read_study(study_path(tmp_path, study_text(arms=arms, env_id="merge-v1")))
@@ -105,8 +113,9 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
         (study_text(steps="true"), "corridor.toml: steps must be a whole number, got True"),
         (study_text(seeds="0"), "corridor.toml: seeds must be at least 1, got 0"),
         (study_text(seeds="[1, 1]"), r"corridor.toml: seeds must be a number or different numbers, got \[1, 1\]"),
+        (study_text(seeds="[0, 0.5]"), r"corridor.toml: seeds\[1\] must be a whole number, got 0.5"),
         (study_text(seeds="[-1]"), r"corridor.toml: seeds must lie in \[0, 1000000000\), got -1"),
-        (study_text(algorithms='["sacc"]'), "corridor.toml: algorithms must be one of ppo, dqn.*, got 'sacc'"),
+        (study_text(algorithms='["sacc"]'), r"corridor.toml: algorithms\[0\] must be one of ppo, dqn.*, got 'sacc'"),
         (study_text(algorithms='"ppo"'), "corridor.toml: algorithms must be an array, got 'ppo'"),
         (study_text(algorithms="{sacc = {}}"), "corridor.toml: algorithms.sacc: no such algorithm; there are ppo, dqn"),
         (study_text(algorithms="{ppo = 3}"), "corridor.toml: algorithms.ppo must be a table, got 3"),

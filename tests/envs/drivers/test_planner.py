@@ -258,7 +258,7 @@ def test_a_reader_of_observations_serves_the_planner(wrapped: bool, monkeypatch:
 def test_a_wrapper_that_changes_actions_is_refused():
     env = make_env("highway-fast-v0", config={"action": {"type": "ContinuousAction"}})
     with pytest.raises(
-        UserError, match="actions of the environment itself, which RescaleAction changes; give the plann"
+        UserError, match="actions of the environment itself, which RescaleAction changes; put RescaleAction around"
     ):
         Planner(gym.wrappers.RescaleAction(env, np.float32(-2), np.float32(2)), ConstantVelocity(ROAD))
     env.reset(seed=0)

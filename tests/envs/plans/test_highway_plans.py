@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from envs.arms import Arm
 from envs.plans import HighwayPlans, Plans, checked_plans, plan_model_for, register_plan_model
 from envs.plans import base as plans_base
 from envs.plans import highway as plans_highway
@@ -15,6 +16,7 @@ from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.simulators.highway_interventions import intervene_on_road, log_road
 from envs.simulators.intervention import Intervention
+from envs.wrappers import ForecastObservation
 from predictor.support.errors import UserError
 
 HORIZON = 4
@@ -210,10 +212,21 @@ def given(
     )
 
 
+class Reversed(gym.ActionWrapper):
+    """Numbers the actions from the other end."""
+
+    def action(self, action: int) -> int:
+        return 4 - action
+
+
 def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("envs.plans._REGISTERED", {})
     with pytest.raises(UserError, match="no plan model knows Blank: pass what_if= an object with names and plans"):
         plan_model_for(Blank())
+    with pytest.raises(
+        UserError, match="the environment itself, which Reversed changes; put Reversed around what needs"
+    ):
+        ForecastObservation(Reversed(make_env("highway-fast-v0")), "constant-velocity", arm=Arm("oracle"))
     model = TwoPlans(Plans(np.zeros((2, 3, 4)), (0, 1)))
     assert isinstance(model, plans_base.PlanModel)
     register_plan_model(Blank, lambda env: model)

@@ -153,7 +153,7 @@ def test_all_batched_readers_keep_the_interface():
 
 def test_memory_follows_the_ids_of_tensor_traffic():
     """A stream that sees the rows of traffic forecasts what one that sees a row alone forecasts."""
-    together, alone = (SceneStream(tiny_model(ROAD), rows, 4, ForecastConfig()) for rows in (6, 1))
+    together, alone = (SceneStream(tiny_model(ROAD), ROAD, rows, ForecastConfig()) for rows in (6, 1))
     traffic, reader = TensorTraffic(6, 9), TensorReader(ROAD)
     for _ in range(5):
         read = reader.read(traffic.agents, np.arange(6))

@@ -11,6 +11,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.sisl.pursuit.pursuit import parallel_env as pursuit_env
 from pettingzoo.utils import BaseParallelWrapper
 
+from envs.parallel import ForecastParallelEnv
 from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.mpe import MPE_FEATURES, MpeReader, is_mpe_env, mpe_scenario
 from predictor.scene import PADDING_ID
@@ -271,11 +272,28 @@ def test_a_treasure_is_another_one_even_if_its_absence_was_not_read():
 def test_an_agent_that_dies_in_an_episode_has_no_index_but_its_body_stays(tag: ParallelEnv):
     reader = MpeReader(tag)
     before = reader.read(tag)
-    tag.agents = [name for name in tag.agents if name != "adversary_1"]
+    tag.unwrapped.agents = [name for name in tag.agents if name != "adversary_1"]
     after = reader.read(tag)
     assert sorted(after.index_of) == ["adversary_0", "adversary_2", "agent_0"]
     np.testing.assert_array_equal(after.scene.ids, before.scene.ids)
     assert after.scene.valid.all()
+
+
+class EndsOne(BaseParallelWrapper):
+    """Ends one agent at the first step; its body stays in the world."""
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, terminations, truncations, infos = self.env.step(actions | {"adversary_1": 0})
+        self.agents = [name for name in self.env.agents if name != "adversary_1"]
+        return observations, rewards, terminations | {"adversary_1": True}, truncations, infos
+
+
+def test_the_last_observation_of_one_that_a_wrapper_ends_has_forecasts():
+    env = ForecastParallelEnv(EndsOne(make("simple_tag_v3")), "constant-velocity")
+    env.reset(seed=0)
+    shown, _, terminations, _, _ = env.step(dict.fromkeys(env.agents, 0))
+    assert terminations["adversary_1"] and "adversary_1" not in env.agents
+    assert [int(seen["valid"].sum()) for seen in shown.values()] == [5, 5, 5, 5]
 
 
 def test_last_observations_have_indices_although_no_agent_lives_by_then():

@@ -3,6 +3,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import MaxAndSkipObservation
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
@@ -10,7 +11,7 @@ from envs.drivers.ego import idle_action
 from envs.readers import reader_for
 from envs.readers.highway import HighwayReader
 from envs.registry import CHECKPOINTS, make_env
-from envs.wrappers import SceneObservation
+from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.scene import PADDING_ID, Scene
 from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import light_env, random_actions, short_env
@@ -103,6 +104,18 @@ def test_time_step_is_what_the_simulator_simulates(policy_hz: int):
     env.step(idle_action(env))
     travelled_m = float(env.unwrapped.vehicle.position[0]) - start_m
     assert reader_for(env).spec.dt_s == pytest.approx(travelled_m / speed_mps, rel=1e-3)
+
+
+def test_a_wrapper_inside_that_repeats_steps_is_refused():
+    """Otherwise all forecasts would be of another time than `dt_s` says."""
+    inside = ForecastObservation(MaxAndSkipObservation(make_env("highway-fast-v0"), skip=3), "constant-velocity")
+    inside.reset(seed=0)
+    with pytest.raises(UserError, match="wrapped at dt_s=1 but 3 s passed between two scenes; put a wrapper that"):
+        inside.step(1)
+    assert inside.reset(seed=1)  # a new episode begins at 0 s
+    outside = MaxAndSkipObservation(ForecastObservation(make_env("highway-fast-v0"), "constant-velocity", flatten=True))
+    outside.reset(seed=0)
+    outside.step(1)
 
 
 def test_states_are_position_and_velocity_of_each_vehicle(env: gym.Env):

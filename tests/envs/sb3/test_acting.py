@@ -223,6 +223,21 @@ def test_a_policy_that_sees_other_images_is_refused(tmp_path: Path):
         load_policy(tmp_path / "policy.zip", other)
 
 
+def test_a_policy_of_other_actions_is_refused(tmp_path: Path):
+    """Its action 0 would be another one here."""
+    untrained(Seeing(PHOTO)).save(tmp_path / "policy.zip")
+    other = Seeing(PHOTO)
+    other.action_space = gym.spaces.Discrete(5)
+    with pytest.raises(UserError, match=r"was trained with the actions Discrete\(3\), but the env takes Discrete\(5\)"):
+        load_policy(tmp_path / "policy.zip", other)
+    watchers = Watchers()
+    watchers.action_space = lambda agent: gym.spaces.Discrete(5)  # type: ignore[method-assign]
+    with pytest.raises(
+        UserError, match=r"policy photo was trained with the actions Discrete\(3\), but the env takes D"
+    ):
+        ActingTeam(untrained(Seeing(PHOTO)), watchers, (), "policy photo")
+
+
 def test_a_team_sees_images():
     team = ActingTeam(untrained(Seeing(PHOTO)), Watchers(), (), "policy photo")
     seen = {agent: PHOTO.sample() for agent in Watchers.possible_agents}
