@@ -66,11 +66,11 @@ def agents_in_sight(env: Any) -> Sequence[str]:
     Raises:
         ProtocolError: before the first reset.
     """
-    inside = env.unwrapped
-    living: Sequence[str] | None = getattr(inside, "agents", None)
-    if living is None:
+    if getattr(env, "agents", None) is None:
         raise ProtocolError("the environment has no agents yet; call reset() first")
-    return living or inside.possible_agents
+    inside = env.unwrapped
+    living: Sequence[str] = inside.agents or inside.possible_agents
+    return living
 
 
 @dataclass(frozen=True)

@@ -429,7 +429,7 @@ def test_a_checkpoint_ships_for_every_registered_id(env_id: str):
 def test_three_axes_are_refused():
     names = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
     spec = SceneSpec(dt_s=1.0, frame=("world",) * 3, feature_names=names, feature_scales=(1.0,) * 6)
-    with pytest.raises(UserError, match="observations need positions in a plane, got 3 axes"):
+    with pytest.raises(UserError, match="positions in a plane, got has_ego=True and 3 axes; SceneStream"):
         ForecastStream(ConstantVelocity(spec), spec, 1, ForecastConfig())
 
 

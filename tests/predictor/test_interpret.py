@@ -469,6 +469,8 @@ def test_smoke_with_labels(
     assert score["direct_r2"] < 0 < score["chance"] < 1  # it is not trained
     assert content["config"]["burn_in_steps"] == 4 and content["provenance"]["command"]
     text = (out / "scores.md").read_text()
+    commonest = content["graph"]["commonest"]
+    assert f"predicting the commonest type for all pairs has accuracy {commonest:.3f}; " in text
     assert "| property | pairs | best | r |" in text and "* DCI: disentanglement – (not defined for one" in text
     assert "| 2 | static |" in text and "| 3 | dynamic |" in text and "nan" not in text
 

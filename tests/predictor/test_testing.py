@@ -298,6 +298,8 @@ def test_nothing_is_found_where_nothing_is_wrong(frame: Any):
 
 def test_what_is_said_of_absent_agents_does_not_count():
     class Absent(Smooth):
+        has_scale = True
+
         def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
             states = super().rollout(belief, *arguments, **named).states
             there = belief.valid[:, None].expand(states.shape[:3])

@@ -307,6 +307,19 @@ def test_a_file_of_another_study_that_is_no_text_is_kept_as_it_is(tmp_path: Path
     assert (out / "study.toml").read_text() == study_text()
 
 
+@pytest.mark.parametrize("alike", [True, False])
+def test_it_says_where_all_training_episodes_begin_alike(
+    alike: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("envpool")
+    monkeypatch.setattr(agents.study, "begins_alike", lambda task: alike and task == "Merge-v0")
+    monkeypatch.setattr(agents.study, "_run_missing", lambda *_: [])
+    text = study_text(arms='["none"]').replace(f'env_id = "{TOY}"', 'env_id = "merge-v1"\nbackend = "envpool"')
+    run_study(config(tmp_path, text))
+    said = "note: EnvPool's Merge-v0 begins every training episode in the same state; the original does not"
+    assert (said in capsys.readouterr().out) == alike
+
+
 def test_a_folder_with_something_else_is_refused(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("mine")

@@ -162,7 +162,7 @@ def test_the_last_scene_has_indices_of_all_agents():
 
 def test_an_agent_that_dies_in_an_episode_has_no_index_but_its_body_stays():
     env = placed([(4, 2), (6, 2)], [(9, 9)])
-    env.agents = ["pursuer_1"]
+    env.unwrapped.agents = ["pursuer_1"]
     multi = PursuitReader(env).read(env)
     assert multi.index_of == {"pursuer_1": 1}
     assert multi.scene.valid.all()
