@@ -324,7 +324,9 @@ def test_a_copy_around_a_monitor_continues_and_counts(again: Callable[[Any], Any
     env.reset()
     assert not episodes(env, 2)
     copy = again(env)
-    assert copy.venv is not env.venv and copy.get_attr("t") == env.get_attr("t")
+    assert (
+        isinstance(copy.venv.venv, VecMonitor) and copy.venv is not env.venv and copy.get_attr("t") == env.get_attr("t")
+    )
     assert episodes(copy, EPISODE) == episodes(env, EPISODE) != []
 
 
