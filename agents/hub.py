@@ -15,7 +15,7 @@ from predictor.checkpoint import CARD, CONSTANT_VELOCITY, shipped
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.hub import PREFIX, fetch, is_hub, push
-from predictor.support.reading import MIB, check_regular
+from predictor.support.reading import MIB, check_regular, read_object
 
 MOST_POLICY_BYTES, MOST_CONFIG_BYTES, MOST_SUMMARY_BYTES = 4096 * MIB, 4 * MIB, 64 * MIB
 """Largest sizes of the files of a policy on a hub."""
@@ -41,13 +41,16 @@ def push_policy_to_hub(path: str | Path, repository: str, private: bool = False)
         raise UserError(f"{path} is on a hub already; push a run folder or a .zip")
     zipped = policy_zip(path)
     algorithm, note = algorithm_of(zipped), read_policy_note(zipped) or PolicyNote()
-    _check_forecaster(note)
+    _check_forecaster(None if note.forecaster is None else note.forecaster.checkpoint, "the forecaster", "--checkpoint")
     name = repository.removeprefix(PREFIX)
     content: dict[str, bytes | Path] = {POLICY_FILE: zipped, CARD: (_HEADER + card_of(note, algorithm, name)).encode()}
     for file, most in ((CONFIG_FILE, MOST_CONFIG_BYTES), (SUMMARY_FILE, MOST_SUMMARY_BYTES)):
         if Path(path).is_dir() and (zipped.parent / file).exists():
             check_regular(zipped.parent / file, most)
             content[file] = zipped.parent / file
+    if CONFIG_FILE in content:
+        sizes_of = read_object(zipped.parent / CONFIG_FILE).get("config", {}).get("sizes_of")
+        _check_forecaster(sizes_of, "the sizes of the checkpoint", "--sizes-of")
     # those of a policy that was there before would be taken for this one's
     superseded = [file for file in (CONFIG_FILE, SUMMARY_FILE) if file not in content]
     return push(zipped, repository, private, f"Policy of {note.env_id or 'an environment'}", content, superseded)
@@ -99,16 +102,20 @@ def card_of(note: PolicyNote, algorithm: str, repository: str) -> str:
     )
 
 
-def _check_forecaster(note: PolicyNote) -> None:
-    """Checks that others can have the forecaster of a policy.
+def _check_forecaster(name: str | None, what: str, option: str) -> None:
+    """Checks that others can have a checkpoint that a policy was trained with.
+
+    Args:
+        name: its name; None for none.
+        what: name of what it gave the policy, for the message.
+        option: option that names it.
 
     Raises:
         UserError: it is a folder of this machine.
     """
-    name = None if note.forecaster is None else note.forecaster.checkpoint
     if name is None or name == CONSTANT_VELOCITY or is_hub(name) or is_own(name) or name in shipped():
         return
     raise UserError(
-        f"the policy was trained on the forecaster '{name}', a folder that others do not have; push that first, train "
-        "with --checkpoint hub:owner/name, and push that policy"
+        f"the policy was trained on {what} '{name}', a folder that others do not have; push that first, train with "
+        f"{option} hub:owner/name, and push that policy"
     )

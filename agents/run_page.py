@@ -14,6 +14,7 @@ from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED, Evaluation, read_evaluation
 from agents.runs import CONFIG_FILE, CURVE_FILE, SUMMARY_FILE, read_config, read_curve
 from agents.summaries import EXTREMES
+from envs.simulators.envpool import ENV_IDS
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
 from predictor.reports.figures import files_of, panels
 from predictor.reports.looks import AS_TEXT, COLORS, GREY
@@ -169,7 +170,9 @@ def _worst(evaluation: Evaluation) -> list[Block]:
         speed = NOTHING if np.isnan(one.mean_speed_mps) else f"{one.mean_speed_mps:.1f}"
         lines.append([str(one.seed), f"{one.episode_return:.2f}", str(one.length), crashed, speed])
     headings = ["seed", "return", "length [steps]", "crashed", "speed [m/s]"]
-    told = f"Episodes of {short(name, 60)} with the lowest returns; dgvae watch RUN --seed SEED films one of them."
+    films = "films are of highway-env, where other episodes have these seeds"
+    films = films if evaluation.env_id in ENV_IDS else "dgvae watch RUN --seed SEED films one of them"
+    told = f"Episodes of {short(name, 60)} with the lowest returns; {films}."
     return [Heading("Worst episodes"), Table(headings, lines), Paragraph(told)]
 
 

@@ -16,7 +16,8 @@ import builtins
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
@@ -56,6 +57,21 @@ class OwnFinder(MetaPathFinder):
     def __init__(self) -> None:
         """Decides nothing yet: the user's folders may still come onto the search path."""
         self.hidden: tuple[str, ...] | None = None
+        self._ours_first = False
+
+    @contextmanager
+    def ours_first(self) -> Iterator[None]:
+        """Gives our modules the names of a checkout, the user's aside: pickles of policies name our classes so."""
+        hidden = self.hidden or ()
+        users = {name: sys.modules.pop(name) for name in list(sys.modules) if name.partition(".")[0] in hidden}
+        self._ours_first = True
+        try:
+            yield
+        finally:
+            self._ours_first = False
+            for name in [name for name in sys.modules if name.partition(".")[0] in hidden]:
+                del sys.modules[name]
+            sys.modules.update(users)
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -78,6 +94,8 @@ class OwnFinder(MetaPathFinder):
     def _users(self, first: str, fullname: str, path: Sequence[str] | None) -> bool:
         """Returns whether a module is the user's: their package, or a module that is in its folder."""
         assert self.hidden is not None
+        if self._ours_first:
+            return False
         return first in self.hidden and (first == fullname or PathFinder.find_spec(fullname, path) is not None)
 
     def _decide(self) -> None:

@@ -47,7 +47,7 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
 
     Raises:
         UserError: the space is no gymnasium space, is composed otherwise than as a flat Dict, or has an entry with the
-            name of an added one.
+            name of an added one, or none but one with the name that wrappers give an array.
     """
     require_space(space, f"the own observation space of {source}")
     if not isinstance(space, gym.spaces.Dict):
@@ -57,6 +57,11 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
                 "flatten it first, in gymnasium with FlattenObservation (gymnasium.wrappers)"
             )
         return {OWN_KEY: space}
+    if set(space.spaces) == {OWN_KEY}:
+        raise UserError(
+            f"the own observation of {source} is a Dict whose only entry is '{OWN_KEY}', the name under which wrappers "
+            "put an array; give the array itself, in gymnasium with TransformObservation"
+        )
     for key, entry in space.spaces.items():
         if isinstance(entry, _COMPOSED):
             raise UserError(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -158,17 +159,23 @@ def _as_scenes(given: AgentTensors, envs: int) -> SceneBatch:
     shape = states.shape[:2]
     valid = np.ones(shape, dtype=np.bool_) if given.valid is None else _as_numpy(given.valid).astype(np.bool_)
     ids = np.broadcast_to(np.arange(shape[1]), shape) if given.ids is None else _as_numpy(given.ids)
-    heading_rad = np.zeros(envs) if given.heading_rad is None else _as_numpy(given.heading_rad).astype(np.float64)
+    heading_rad = np.zeros(envs) if given.heading_rad is None else _as_numpy(given.heading_rad)
     for name, array, wanted in (("valid", valid, shape), ("ids", ids, shape), ("heading_rad", heading_rad, shape[:1])):
         if array.shape != wanted:
             raise UserError(
                 f"TensorReader needs {name} of the shape {wanted}, as the states have it, got {array.shape}"
             )
+    for name, array in (("states", states), ("heading_rad", heading_rad)):
+        if array.dtype.kind not in "fiu":
+            raise UserError(f"TensorReader needs {name} that are numbers, got {array.dtype}")
     if ids.dtype.kind not in "iu":
         raise UserError(f"TensorReader needs ids that are whole numbers, got {ids.dtype}")
-    cleared = np.where(valid[..., None], states, 0.0).astype(np.float64, copy=False)
-    return SceneBatch(cleared, np.where(valid, ids, PADDING_ID).astype(np.int64, copy=False), valid, heading_rad)
+    states = np.where(valid[..., None], states, 0.0).astype(np.float64, copy=False)
+    ids = np.where(valid, ids, PADDING_ID).astype(np.int64, copy=False)
+    return SceneBatch(states, ids, valid, heading_rad.astype(np.float64, copy=False))
 
 
 def _as_numpy(array: Any) -> np.ndarray:
-    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+    if not isinstance(array, Tensor):
+        return np.asarray(array)
+    return (array.float() if array.dtype is torch.bfloat16 else array).detach().cpu().numpy()  # NumPy has no bfloat16

@@ -11,9 +11,11 @@ import json
 import math
 import os
 import pickle
+import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
@@ -261,6 +263,12 @@ def algorithm_of(path: Path) -> Algorithm:
     return found
 
 
+def _our_names() -> AbstractContextManager[None]:
+    """Returns what lets a pickle find our classes where a user's folders hide ours (`dgvae_rl.own_packages`)."""
+    finders = [each.ours_first for each in sys.meta_path if hasattr(each, "ours_first")]
+    return finders[0]() if finders else nullcontext()
+
+
 def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
     """Loads a policy of any known algorithm. Its zip holds pickled data: load only files whose source you trust.
 
@@ -275,7 +283,8 @@ def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> 
     algorithm = algorithm_of(path)
     kind = algorithm_class(algorithm)
     try:
-        return kind.load(path, env=venv, device=device)
+        with _our_names():
+            return kind.load(path, env=venv, device=device)
     except (
         *(ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError),
         *(ImportError, pickle.PickleError),

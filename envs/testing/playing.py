@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from pettingzoo import ParallelEnv
 
 from envs.multiagent_observation import check_multiagent_scene
-from envs.own_observation import require_space
+from envs.own_observation import own_spaces, require_space
 from envs.readers import FunctionReader, MakeReader, multiagent_reader_for, reader_for
 from envs.readers.base import build_multiagent_reader, build_reader, require_scene, show
 from envs.testing.asking import ReaderProblem, asked_reset, asked_step
@@ -137,17 +137,19 @@ def open_reader(env: Any, make_reader: MakeReader | None) -> OpenReader:
 
 
 def space_problems(env: Any) -> list[str]:
-    """Returns a line for the first space that is none of gymnasium's; nothing if all are."""
+    """Returns a line for the first space that a wrapper would refuse; nothing if there is none."""
     if isinstance(env, ParallelEnv):
         agents = [
-            (f"'{agent}': ", env.observation_space(agent), env.action_space(agent)) for agent in env.possible_agents
+            (f"'{agent}': ", f"'{agent}'", env.observation_space(agent), env.action_space(agent))
+            for agent in env.possible_agents
         ]
     else:
-        agents = [("", env.observation_space, env.action_space)]
-    for whose, observation, action in agents:
+        agents = [("", "the environment", env.observation_space, env.action_space)]
+    for whose, source, observation, action in agents:
         try:
             require_space(observation, f"{whose}the observation space")
             require_space(action, f"{whose}the action space")
+            own_spaces(observation, source)
         except UserError as error:
             return [str(error)]
     return []

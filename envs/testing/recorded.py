@@ -166,6 +166,8 @@ def _misfit(seen: Any, space: Any) -> str:
             return f" must be a dict with {list(space.spaces)}, got {got}"
         return next((f"['{key}']{why}" for key, value in seen.items() if (why := _misfit(value, space[key]))), "")
     if isinstance(space, gym.spaces.Box):
+        if as_numbers(seen) is None:
+            return f" is a {type(seen).__name__} and no array of numbers, its space {short(space, 60)}"
         if np.shape(seen) != space.shape:
             return f" has the shape {np.shape(seen)}, its space {space.shape}"
         if np.issubdtype(space.dtype, np.integer) and np.asarray(seen).dtype.kind == "f":
@@ -179,6 +181,7 @@ def _misfit(seen: Any, space: Any) -> str:
         return ""
     if isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary):
         inside = space.contains(seen) or space.contains(np.asarray(seen))
+        inside = inside or (np.size(seen) == 1 and space.contains(np.asarray(seen).item()))
         return "" if inside else f" is {short(repr(seen), 60)}, its space {space}"
     return ""
 

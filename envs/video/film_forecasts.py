@@ -141,8 +141,9 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
                 base.viewer = self._viewer = large_viewer(base)
             rendered: Any = self.env.render()
             surface = base.viewer.sim_surface
-            origin_m = (float(surface.origin[0]), float(surface.origin[1]))
-            return np.ascontiguousarray(rendered), View(origin_m, float(surface.scaling))
+            # a reader may count positions from elsewhere; the ego is at one place in the picture and in the scene
+            origin_m = np.asarray(surface.origin) + self._forecasts.scene.states[0, :2] - base.vehicle.position
+            return np.ascontiguousarray(rendered), View((float(origin_m[0]), float(origin_m[1])), surface.scaling)
         drawn = self._draw(base)
         picture: Any
         picture, view = (self.env.render(), drawn) if isinstance(drawn, View) else drawn

@@ -206,7 +206,13 @@ class _Recorder:
             dt_s=policy_step_s(config),
             style=style,
         )
-        self._reader: HighwayReader = env.get_wrapper_attr("reader")
+        reader = env.get_wrapper_attr("reader")
+        if not isinstance(reader, HighwayReader):
+            raise UserError(
+                "films with the pictures between two steps need highway-env's own reader, got "
+                f"{type(reader).__name__}; film with FilmForecasts and record_pictures"
+            )
+        self._reader: HighwayReader = reader
         self._action_names = {number: name for name, number in constant_actions(env).items()}
 
     def begin(self) -> None:

@@ -136,6 +136,14 @@ def test_a_forecaster_that_others_lack_is_named(hub: Hub, tmp_path: Path):
     assert hub.repositories == {}
 
 
+def test_sizes_of_a_checkpoint_that_others_lack_are_named(hub: Hub, tmp_path: Path):
+    path, _ = saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW))
+    (path.parent / "config.json").write_text('{"config": {"sizes_of": "runs/mine"}}')
+    with pytest.raises(UserError, match="the sizes of the checkpoint 'runs/mine', a folder .*--sizes-of hub:"):
+        push_policy_to_hub(path.parent, "me/fast")
+    assert hub.repositories == {}
+
+
 def test_the_command_knows_policies_from_predictors(
     hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

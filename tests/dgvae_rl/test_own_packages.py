@@ -81,6 +81,22 @@ assert envs.readers.__name__ == "dgvae_rl.envs.readers"
     run(code, project)
 
 
+def test_policies_load_beside_a_users_modules_of_the_same_names(project: Path):
+    """Their pickles name our classes as a checkout does; the user's modules are as they were afterwards."""
+    for name in ("features", "plan_scores"):
+        (project / "agents" / f"{name}.py").write_text("MINE = 'theirs'\n")
+    code = """
+import agents.features, envs
+from dgvae_rl import load_policy
+policy, env = load_policy("roundabout")
+print(policy(env.reset(seed=0)[0]), agents.features.MINE)
+import agents.plan_scores, envs.wrappers
+print(agents.plan_scores.MINE, agents.MINE, envs.wrappers.Mine is envs.Mine)
+"""
+    first, second = run(code, project).splitlines()
+    assert first.split()[1] == "theirs" and second == "theirs theirs True"
+
+
 @pytest.mark.slow
 def test_names_of_modules_in_strings_lead_to_ours(project: Path):
     """PettingZoo factories, ids that are registered with gymnasium, lazy exports."""

@@ -136,6 +136,8 @@ def test_what_cannot_stay_beside_the_forecasts_is_named():
         own_spaces(gym.spaces.Dict({"deep": clash}), "env 'a'")
     with pytest.raises(UserError, match="must be one array or a Dict of arrays, got Tuple"):
         own_spaces(gym.spaces.Tuple([box]), "env 'a'")
+    with pytest.raises(UserError, match="a Dict whose only entry is 'observation', the name under which wrappers"):
+        own_spaces(gym.spaces.Dict({"observation": box}), "env 'a'")
 
     class Clash(DictCrowd):
         def __init__(self) -> None:

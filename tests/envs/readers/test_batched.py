@@ -146,6 +146,19 @@ def test_vmas_itself():
         np.testing.assert_allclose(read.states[:, agent, :2], env.agents[agent].state.pos.numpy(), rtol=1e-6)
 
 
+def test_numbers_of_every_width_are_read_and_words_refused():
+    half = torch.arange(16.0).reshape(1, 4, 4).bfloat16()
+    read = TensorReader(ROAD).read(AgentTensors(half), np.arange(1))
+    np.testing.assert_array_equal(read.states[0, 0], [0.0, 1.0, 2.0, 3.0])
+    words = np.full((1, 4, 4), "a")
+    for given, name in (
+        (AgentTensors(words), "states"),
+        (AgentTensors(half, heading_rad=words[0, 0, :1]), "heading_rad"),
+    ):
+        with pytest.raises(UserError, match=f"TensorReader needs {name} that are numbers, got <U1"):
+            TensorReader(ROAD).read(given, np.arange(1))
+
+
 def test_all_batched_readers_keep_the_interface():
     for reader in (TensorReader(ROAD), PoolReader(HIGHWAY_SPEC, 2), VmasReader(vmas_like(2))):
         assert isinstance(reader, BatchedReader)

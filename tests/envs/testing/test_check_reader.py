@@ -24,6 +24,7 @@ from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.semantics import DT_S, LIVES, SUBJECTS, Crowd, Swarm, SwarmReader, named, read_crowd
 
+BOX = gym.spaces.Box(-np.inf, np.inf, (2,))
 SPEC = SceneSpec(dt_s=DT_S, feature_scales=(10.0, 10.0, 1.0, 1.0), perception_m=1000.0)
 
 
@@ -319,6 +320,47 @@ def test_names_of_agents_are_needed():
     swarm = Swarm()
     del swarm.possible_agents
     assert any("Swarm has no possible_agents; set it" in line for line in reader_problems(swarm, SwarmReader))
+
+
+class Shows(Pushed):
+    """Shows something else than a crowd does."""
+
+    def __init__(self, space: gym.Space, shown: Any) -> None:
+        super().__init__()
+        self.observation_space, self.shown = space, shown
+
+    def reset(self, **options: Any) -> Any:
+        return self.shown, super().reset(**options)[1]
+
+    def step(self, action: np.ndarray) -> Any:
+        return self.shown, *super().step(action)[1:]
+
+
+@pytest.mark.parametrize(
+    ("space", "shown", "found"),
+    [
+        (gym.spaces.Dict({"valid": BOX}), {"valid": np.zeros(2)}, "the environment has an entry 'valid', as forecasts"),
+        (gym.spaces.Tuple([BOX]), (np.zeros(2),), "the environment must be one array or a Dict of arrays, got Tuple"),
+        (BOX, [[1.0, 2.0], [3.0]], "observation is a list and no array of numbers, its space Box"),
+        (gym.spaces.Discrete(3), np.array([3]), r"observation is array\(\[3\]\), its space Discrete\(3\)"),
+    ],
+)
+def test_what_wrappers_refuse_is_found(space: gym.Space, shown: Any, found: str):
+    with pytest.raises(UserError, match=found):
+        check_reader(Shows(space, shown), FunctionReader(read_crowd, SPEC))
+
+
+def test_a_counted_observation_may_be_an_array_of_one():
+    problems = reader_problems(Shows(gym.spaces.Discrete(3), np.array([2])), FunctionReader(read_crowd, SPEC))
+    assert not any("its space" in problem for problem in problems)
+
+
+def test_agents_whose_observations_wrappers_refuse_are_found():
+    swarm = Swarm()
+    swarm.observation_space = lambda agent: gym.spaces.Tuple([BOX])  # type: ignore[method-assign]
+    assert any(
+        "must be one array or a Dict of arrays, got Tuple" in line for line in reader_problems(swarm, SwarmReader)
+    )
 
 
 def test_without_a_reader_there_is_nothing_to_check():

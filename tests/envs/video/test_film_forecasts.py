@@ -12,11 +12,12 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 
 from envs import FilmForecasts, ForecastObservation, FunctionReader, View, register_view
-from envs.readers import outcomes
+from envs.readers import EntityRowsReader, outcomes
 from envs.readers.outcomes import OutcomeKeys
 from envs.video import film_forecasts, window
 from envs.video.drawing import OverlayStyle
 from envs.video.film_forecasts import record_pictures
+from envs.video.highway import record_episode
 from predictor import Scene, SceneSpec, UserError
 
 STYLE = OverlayStyle(forecast_color=(255, 0, 0), edge_alpha=0)
@@ -148,6 +149,25 @@ def test_record_video_films_highway_env_with_its_forecasts(tmp_path: Path):
     if video is not filming:
         (film,) = tmp_path.glob("*.mp4")
         assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_reader_that_counts_from_elsewhere_is_drawn_where_the_cars_are():
+    env = gym.make("highway-v0", render_mode="rgb_array", config={"vehicles_count": 5, "duration": 3})
+    kinematics = EntityRowsReader(
+        ("presence", "x", "y", "vx", "vy"), SceneSpec(dt_s=1.0, frame=("ego", "world")),
+        scales=(1.0, 200.0, 16.0, 80.0, 80.0), relative=True, dead_reckoning=True,
+    )  # fmt: skip
+    seen = ForecastObservation(env, "constant-velocity", reader=kinematics)
+    filming = FilmForecasts(seen, style=STYLE)
+    filming.reset(seed=0)
+    filming.step(1)
+    vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
+    assert abs(vehicle.position[0] - seen.scene.states[0, 0]) > 50
+    _, view = filming._picture()
+    surface: Any = env.unwrapped.viewer.sim_surface  # type: ignore[attr-defined]
+    np.testing.assert_allclose(view.pixels(seen.scene.states[:1, :2])[0], surface.vec2pix(vehicle.position), atol=2)
+    with pytest.raises(UserError, match="need highway-env's own reader, got _EntityRows; film with FilmForecasts"):
+        record_episode(seen, lambda observation: 1)
 
 
 def _has_moviepy() -> bool:
