@@ -4,6 +4,7 @@ Each episode is a function of its seed and the options alone, so the store is th
 recording that is stopped goes on where it stopped when its command is repeated.
 """
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -202,7 +203,8 @@ def recording_of(config: CollectConfig) -> Recording:
     """Returns what is recorded of each episode.
 
     Raises:
-        UserError: the environment cannot be perturbed or copied, where that is asked for.
+        UserError: the environment cannot be perturbed or copied, where that is asked for, or labels of branches are of
+            a longer time than these are played.
     """
     plain = Recording(config.max_steps, config.labels)
     if not (config.perturb or config.causal_labels or config.branches):
@@ -212,6 +214,9 @@ def recording_of(config: CollectConfig) -> Recording:
     given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     causal = replace(settings_for(world), senders=config.causal_senders, **changes)
+    most_s = branch_mix_for(world).horizon_s if config.branches else math.inf
+    if causal.horizon_s > most_s:
+        raise UserError(f"a branch is played for {most_s:g} s, got causal_horizon_s {causal.horizon_s:g}; lower it")
     return replace(
         plain,
         perturb=config.perturb,

@@ -29,7 +29,8 @@ SHARES: dict[Kind, float] = {"brake": 0.55, "accelerate": 0.2, "remove": 0.25}
 FREE = 0.6
 """Probability that a driver is free after its speed has changed; otherwise it holds the speed for a while."""
 EGO_SHARE = 0.3
-"""Probability that the ego is the one that is perturbed, if others are possible too: policies ask what they cause."""
+"""Probability that a draw is of the ego, if others are possible too: policies ask what they cause. Of the branches that
+are kept fewer are, where the ego seldom moves anybody (`TRIES`)."""
 AT_REST = 0.25
 """Share of the least loss of speed below which an agent's speed is too low for it to brake."""
 TRIES = 3

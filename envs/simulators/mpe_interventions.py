@@ -53,7 +53,14 @@ def log_particles(world: Any) -> MotionLog:
 
 
 def hold_particles(world: Any, log: MotionLog, free: Sequence[Any]) -> None:
-    """Holds all agents but some to a log; called before any intervention."""
+    """Holds all agents but some to a log; called before any intervention.
+
+    Raises:
+        UserError: one of those is no agent that acts.
+    """
+    for body in free:
+        if not any(body is agent for agent in world.agents):
+            raise UserError(f"only agents that act can be free of a log, got {getattr(body, 'name', body)}")
     _standing(world).held = HeldAgents(_parts(world.agents), log, _parts(free))
 
 

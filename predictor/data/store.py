@@ -71,7 +71,8 @@ class Episode:
     NaN where unknown: at all steps and for all senders that were not tried. `predictor.data.causal_edges` makes edges
     of it."""
     perturbed: Int[np.ndarray, "time agents"] | None = None
-    """What is done to each agent from this step to the next, an index in `PERTURBATIONS`; None if nothing ever is."""
+    """What is done to each agent from this step to the next, an index in `PERTURBATIONS`; None if nothing ever is. Of a
+    branch, what begins at its moment, in the step before it alone, also if it lasts."""
 
     @staticmethod
     def from_scenes(scenes: Sequence[Scene], label: str = "", seed: int = 0) -> "Episode":

@@ -53,8 +53,9 @@ def locked_path(path: Path) -> Iterator[None]:
     if is_remote(path):
         yield
         return
-    lock = path.with_name(f".{path.name}.lock")
-    with _made(path.parent), _held_file(lock, f"another process writes {path}", "path"):
+    place = Path(os.path.realpath(path))  # what a link leads to is what is written
+    lock = place.with_name(f".{place.name}.lock")
+    with _made(place.parent), _held_file(lock, f"another process writes {path}", "path"):
         yield
 
 

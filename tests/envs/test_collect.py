@@ -268,6 +268,10 @@ ERRORS = {
     "long-horizon": (["--causal-labels", "1", "--causal-horizon-s", "3601"], "causal_horizon_s must be at most 3,600"),
     "senders-of-nothing": (["--causal-senders", "3"], "causal_senders needs causal_labels or branches above 0, got 0"),
     "history-of-nothing": (["--branch-history-steps", "20"], "branch_history_steps needs branches above 0, got 0"),
+    "horizon-of-branches": (
+        ["--branches", "2", "--causal-horizon-s", "6"],
+        "a branch is played for 5 s, got causal_hor",
+    ),
     "horizon-of-nothing": (["--causal-horizon-s", "2"], "causal_horizon_s and causal_threshold_m need causal_labels"),
     "no-senders": (["--causal-labels", "2", "--causal-senders", "0"], "causal_senders must be at least 1, got 0"),
     "no-lanes": (

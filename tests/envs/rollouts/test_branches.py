@@ -35,6 +35,15 @@ def test_a_follower_is_held_back_and_no_one_else():
     assert np.abs(shift[:, [0, 3, 4]]).max() < 1e-9
 
 
+def test_what_never_acts_cannot_be_the_receiver_of_a_direct_effect():
+    """A landmark of mpe2."""
+    world = open_world("simple_tag_v3", "idle")
+    world.reset(0)
+    point = BranchPoint(world, 2)
+    with pytest.raises(UserError, match="only agents that act can be free of a log, got landmark 0"):
+        point.direct(Intervention(1, "brake", 1, change_mps=1.0), 4)
+
+
 def test_a_measurement_at_once_starts_from_the_slower_scene():
     world = road_world(*CARS, ego_m=(0.0, 12.0))
     found = branch(world, Intervention(2, "brake", 0, change_mps=8.0, at_once=True), 5)

@@ -28,8 +28,11 @@ def test_a_folder_and_a_store_are_held_by_one_process_until_it_ends_however_it_e
         assert holder.stdout.readline() == b"held\n"
         with pytest.raises(UserError, match=rf"^another training runs in .*run \(process {holder.pid}\); wait for"):
             locked(folder, "training").__enter__()
-        with pytest.raises(UserError, match=rf"^another process writes .*store \(process {holder.pid}\); wait for"):
-            locked_path(store).__enter__()
+        (tmp_path / "link").symlink_to(store)
+        for path in (store, tmp_path / "link"):
+            with pytest.raises(UserError, match=rf"^another process writes {path} \(process {holder.pid}\); wait for"):
+                locked_path(path).__enter__()
+        (tmp_path / "link").unlink()
     finally:
         holder.kill()
         holder.wait()
