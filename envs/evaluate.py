@@ -363,9 +363,8 @@ def main() -> None:
         driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
         world = open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs)
         world.close()
-        if len(config.checkpoint) < 2 and (
-            config.checkpoint or not causes
-        ):  # what does not fit is an error; of several, it is noted
+        # what does not fit is an error; of several, it is noted
+        if len(config.checkpoint) < 2 and (config.checkpoint or not causes):
             chosen = config.checkpoint[0] if config.checkpoint else checkpoint_for(env_id)
             load_forecaster(chosen, world.spec, f"env '{env_id}'")
     for checkpoint in config.checkpoint:
