@@ -86,9 +86,12 @@ def test_policies_load_beside_a_users_modules_of_the_same_names(project: Path):
     for name in ("features", "plan_scores"):
         (project / "agents" / f"{name}.py").write_text("MINE = 'theirs'\n")
     code = """
+import sys
 import agents.features, envs
 from dgvae_rl import load_policy
+theirs = sys.modules["agents.features"]
 policy, env = load_policy("roundabout")
+assert sys.modules["agents.features"] is theirs
 print(policy(env.reset(seed=0)[0]), agents.features.MINE)
 import agents.plan_scores, envs.wrappers
 print(agents.plan_scores.MINE, agents.MINE, envs.wrappers.Mine is envs.Mine)
