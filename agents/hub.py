@@ -9,13 +9,13 @@ code on this machine. Naming a commit (owner/name@commit) keeps later changes ou
 import functools
 from pathlib import Path
 
-from agents.runs import CONFIG_FILE, POLICY_FILE, SUMMARY_FILE, policy_zip
+from agents.runs import CONFIG_FILE, POLICY_FILE, SUMMARY_FILE, policy_zip, read_config
 from envs.sb3.policy_file import PolicyNote, algorithm_of, read_policy_note
 from predictor.checkpoint import CARD, CONSTANT_VELOCITY, shipped
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.hub import PREFIX, fetch, is_hub, push
-from predictor.support.reading import MIB, check_regular, read_object
+from predictor.support.reading import MIB, check_regular
 
 MOST_POLICY_BYTES, MOST_CONFIG_BYTES, MOST_SUMMARY_BYTES = 4096 * MIB, 4 * MIB, 64 * MIB
 """Largest sizes of the files of a policy on a hub."""
@@ -49,8 +49,7 @@ def push_policy_to_hub(path: str | Path, repository: str, private: bool = False)
             check_regular(zipped.parent / file, most)
             content[file] = zipped.parent / file
     if CONFIG_FILE in content:
-        sizes_of = read_object(zipped.parent / CONFIG_FILE).get("config", {}).get("sizes_of")
-        _check_forecaster(sizes_of, "the sizes of the checkpoint", "--sizes-of")
+        _check_forecaster(read_config(zipped.parent).get("sizes_of"), "the sizes of the checkpoint", "--sizes-of")
     # those of a policy that was there before would be taken for this one's
     superseded = [file for file in (CONFIG_FILE, SUMMARY_FILE) if file not in content]
     return push(zipped, repository, private, f"Policy of {note.env_id or 'an environment'}", content, superseded)

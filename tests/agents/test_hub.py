@@ -137,8 +137,10 @@ def test_a_forecaster_that_others_lack_is_named(hub: Hub, tmp_path: Path):
 
 
 def test_sizes_of_a_checkpoint_that_others_lack_are_named(hub: Hub, tmp_path: Path):
-    path, _ = saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW))
-    (path.parent / "config.json").write_text('{"config": {"sizes_of": "runs/mine"}}')
+    path, _ = saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW), run=True)
+    content = json.loads((path.parent / "config.json").read_text())
+    content["config"]["sizes_of"] = "runs/mine"
+    (path.parent / "config.json").write_text(json.dumps(content))
     with pytest.raises(UserError, match="the sizes of the checkpoint 'runs/mine', a folder .*--sizes-of hub:"):
         push_policy_to_hub(path.parent, "me/fast")
     assert hub.repositories == {}
