@@ -251,9 +251,11 @@ def _ranked(value: Callable[[Weights], Float[np.ndarray, " draws"]], pairs: Caus
     batches = int(batch.max()) + 1
     if batches < 2:
         return Estimate(found, None)
-    drawn = bootstrap_draws(batches, draws=RANKING_DRAWS).astype(np.float64)
+    drawn = np.concatenate([1.0 - np.eye(batches), bootstrap_draws(batches, draws=RANKING_DRAWS)])
     parts = np.array_split(drawn, max(1, drawn.shape[0] * len(pairs) // 2_000_000))
-    return Estimate(found, central_interval(np.concatenate([value(part[:, batch]) for part in parts])))
+    values = np.concatenate([value(part[:, batch]) for part in parts])
+    rests_on_one = not np.isfinite(values[:batches]).all()
+    return Estimate(found, None if rests_on_one else central_interval(values[batches:]))
 
 
 def _decisions(score: Float[np.ndarray, " pairs"], pairs: CausalPairs, bound: float | None) -> dict[str, Any]:

@@ -41,7 +41,7 @@ class Estimate:
     value: float
     """Value over all episodes."""
     interval: tuple[float, float] | None
-    """95 % bootstrap over episodes; None with fewer than two."""
+    """95 % bootstrap over episodes; None with fewer than two, or where all rests on one."""
 
 
 def ratio_statistics(
@@ -138,10 +138,20 @@ def bootstrap_interval(
         seed: random seed of the draws.
 
     Returns:
-        Lower and upper limit over the draws where the function is defined; None with fewer than two batches, or if it
-        is defined nowhere.
+        Lower and upper limit over the draws where the function is defined; None with fewer than two batches, or if
+        the function rests on one of them: is not defined without it.
     """
-    return None if len(sums) < 2 else central_interval(value(bootstrap_sums(sums, seed)))
+    if len(sums) < 2 or not np.isfinite(value(sums_without_each(sums))).all():
+        return None
+    return central_interval(value(bootstrap_sums(sums, seed)))
+
+
+def sums_without_each(sums: Float[np.ndarray, "batches parts"]) -> Float[np.ndarray, "batches parts"]:
+    """Returns the sums over all batches but each one in turn; what is 0 in all others is exactly 0."""
+    nothing = np.zeros((1, sums.shape[1]))
+    before = np.concatenate([nothing, sums[:-1].cumsum(axis=0)])
+    after = np.concatenate([sums[:0:-1].cumsum(axis=0)[::-1], nothing])
+    return before + after
 
 
 def bootstrap_sums(

@@ -165,6 +165,16 @@ def test_intervals_are_over_episodes():
     assert alike.auc == Estimate(1.0, (1.0, 1.0))
 
 
+def test_what_rests_on_one_episode_has_no_interval():
+    """All edges of the tested half are in one of its three episodes; accuracy is of all three."""
+    exists = [True, False] * 3 + [True, False] + [False] * 4
+    score = np.tile([1.0, 0.0, 0.0], 4)
+    found = score_rule(score, pairs(exists, np.repeat(range(6), 2)), 0.5)
+    for estimate in (found.auc, found.average_precision, found.recall):
+        assert estimate is not None and estimate.interval is None
+    assert found.accuracy is not None and found.accuracy.interval is not None
+
+
 def test_without_labels_there_are_no_numbers():
     found = score_rule(np.zeros(0), pairs([], np.zeros(0, dtype=int)), 0.5)
     assert (found.pairs, found.f1, found.auc) == (0, None, None)

@@ -7,8 +7,10 @@ from predictor.evaluation.standard_errors import (
     Statistic,
     batch_interval,
     bootstrap_interval,
+    quotient,
     ratio_statistics,
     subset_ratios,
+    sums_without_each,
 )
 
 
@@ -138,12 +140,29 @@ def test_the_bootstrap_of_a_function_is_that_of_the_ratio():
     assert found == pytest.approx(batch_interval(sums, counts, seed=5))
 
 
+def _share(sums: np.ndarray) -> np.ndarray:
+    return quotient(sums[:, 0], sums[:, 1])
+
+
 def test_draws_in_which_a_function_is_not_defined_are_left_out():
-    parts = np.array([[1.0, 1.0], [0.0, 0.0]])
-
-    def ratio(sums: np.ndarray) -> np.ndarray:
-        return np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1e-9), np.nan)
-
-    assert bootstrap_interval(parts, ratio) == (1.0, 1.0)
+    parts = np.array([[1.0, 1.0], [0.0, 3.0], [0.0, 0.0]])
+    assert bootstrap_interval(parts, _share) == (0.0, 1.0)
     assert bootstrap_interval(parts, lambda sums: np.full(len(sums), np.nan)) is None
-    assert bootstrap_interval(parts[:1], ratio) is None
+    assert bootstrap_interval(parts[:1], _share) is None
+
+
+@pytest.mark.parametrize("place", [0, 1, 49])
+def test_what_rests_on_one_batch_has_no_interval(place: int):
+    """Every draw that has it has the same value, so the interval would have no width and claim certainty."""
+    parts = np.zeros((50, 2))
+    parts[place] = 0.2, 0.3
+    assert bootstrap_interval(parts, _share) is None
+    parts[place - 1] = 0.1, 0.1
+    assert bootstrap_interval(parts, _share) == pytest.approx((2 / 3, 1.0))
+
+
+def test_sums_without_each_are_those_of_all_others():
+    parts = np.random.default_rng(0).random((7, 3))
+    expected = [np.delete(parts, place, axis=0).sum(axis=0) for place in range(7)]
+    np.testing.assert_allclose(sums_without_each(parts), expected)
+    assert (sums_without_each(np.array([[0.0], [0.1], [0.0]])) == [[0.1], [0.0], [0.1]]).all()
