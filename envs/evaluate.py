@@ -255,9 +255,9 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     """
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
-    for env_id in config.env_ids:
-        # an error for all checkpoints is no misfit of one
+    for env_id in config.env_ids:  # an error for all checkpoints, before hours of work
         _check_unseen(_stores_of(config.data, env_id, config.env_kwargs), config.seed, config.episodes)
+    for env_id in config.env_ids:
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
@@ -274,7 +274,18 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
             console.print(report.remarks(result), markup=False)
             if config.out is not None:
                 report.write_pictures(config.out, result, cases)
+                _write(config.out, config, results, misfits)
     return results, misfits
+
+
+def _write(
+    out: Path, config: EvaluateConfig, results: Sequence[EnvAccuracy], misfits: dict[tuple[str, str], str]
+) -> None:
+    """Writes accuracy.json and accuracy.md of what is measured so far: the next may fail."""
+    content: dict[str, Any] = {"config": asdict(config), "results": [asdict(result) for result in results]}
+    misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
+    write_json(out / "accuracy.json", finite(content | {"misfits": misfit, "provenance": provenance(PACKAGES)}))
+    write_text(out / "accuracy.md", report.markdown(results, misfits))
 
 
 def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
@@ -379,11 +390,7 @@ def main() -> None:
     if len(config.checkpoint) > 1:
         console.print(report.transfer(results, misfits))
     if config.out is not None:
-        made = provenance(PACKAGES)
-        content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
-        misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
-        write_json(config.out / "accuracy.json", finite(content | {"misfits": misfit, "provenance": made}))
-        write_text(config.out / "accuracy.md", report.markdown(results, misfits))
+        _write(config.out, config, results, misfits)  # misfits after the last result, too
     if misfits and len(config.checkpoint) < 2:
         kept = f"; all else is in {config.out}" if config.out is not None else ""
         raise UserError(f"not measured: {'; '.join(misfits.values())}{kept}")

@@ -341,6 +341,37 @@ def test_of_several_environments_one_that_cannot_be_measured_costs_no_other(
     assert written["misfits"] == [{"env_id": ROAD, "checkpoint": STILL, "why": f"{ROAD}: no forecast"}]
 
 
+def test_what_is_measured_stays_when_a_later_environment_fails(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    words = ["--env-ids", TAG, ROAD, "--checkpoint", STILL, "--episodes", "1", "--max-steps", "6", "--num-samples", "2"]
+    words += ["--workers", "1", "--out", str(tmp_path)]
+    played = evaluate.evaluate_env
+
+    def fail_on_the_road(config: Any, env_id: str, checkpoint: str) -> Any:
+        if env_id == ROAD:
+            raise EnvironmentFailedError(f"{ROAD}, seed 3, step 2: RuntimeError: engine")
+        return played(config, env_id, checkpoint)
+
+    monkeypatch.setattr(evaluate, "evaluate_env", fail_on_the_road)
+    code, errors, _ = run_command(evaluate.main, words, monkeypatch, capsys)
+    assert code != 0 and "engine" in errors[-1]
+    written = json.loads((tmp_path / "accuracy.json").read_text())
+    assert [result["env_id"] for result in written["results"]] == [TAG]
+    assert TAG in (tmp_path / "accuracy.md").read_text()
+
+
+def test_all_stores_are_looked_for_before_anything_is_played(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (recorded,) = collect(CollectConfig(ROAD, tmp_path, 1, ("idle",), 5, 6, False, 1))
+    write_store(tmp_path / ROAD, StoreInfo(HighwayReader(make_env(ROAD)).spec, ROAD), [recorded])
+    monkeypatch.setattr(evaluate, "evaluate_env", lambda *_: pytest.fail("was played"))
+    config = EvaluateConfig(env_ids=(ROAD, TAG), checkpoint=(STILL,), data=(tmp_path,))
+    with pytest.raises(UserError, match=f"data: no store of {TAG}"):
+        evaluate.evaluate(config, Console())
+
+
 # --- Whole runs -------------------------------------------------------------------------------------------------------
 
 
