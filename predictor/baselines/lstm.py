@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.baselines.base import Tensors, UnrolledForecaster, check_sizes
+from predictor.layers.rnn import full_precision
 from predictor.layers.state_codec import Residual
 from predictor.scene import MOST_AGENTS, SceneSpec
 from predictor.support.config_checks import check_at_most
@@ -80,11 +81,11 @@ class LSTM(UnrolledForecaster):
         present = valid[..., None]
         if not self.config.joint:
             flat = [t.flatten(0, 1) for t in (inputs, *nodes)]
-            hidden, cell = self.cell(torch.relu(self.embed(flat[0])), (flat[1], flat[2]))
+            hidden, cell = self._step(flat[0], flat[1], flat[2])
             return hidden.view_as(nodes[0]) * present, cell.view_as(nodes[1]) * present
         *memory, mark = nodes
         hidden, cell = (_of_first(m, valid & (mark[..., 0] > 0)) for m in memory)
-        hidden, cell = self.cell(torch.relu(self.embed(self._side_by_side(inputs, valid))), (hidden, cell))
+        hidden, cell = self._step(self._side_by_side(inputs, valid), hidden, cell)
         return hidden[:, None] * present, cell[:, None] * present, present.to(inputs.dtype)
 
     def change(
@@ -100,6 +101,14 @@ class LSTM(UnrolledForecaster):
             change = change.unflatten(-1, (self.columns, -1))
             change = functional.pad(change, (0, 0, 0, valid.shape[-1] - self.columns))
         return change
+
+    def _step(
+        self, inputs: Float[Tensor, "rows inputs"], hidden: Float[Tensor, "rows rnn"], cell: Float[Tensor, "rows rnn"]
+    ) -> tuple[Float[Tensor, "rows rnn"], Float[Tensor, "rows rnn"]]:
+        embedded = torch.relu(self.embed(inputs)).to(hidden.dtype)
+        with full_precision(inputs.device):
+            hidden, cell = self.cell(embedded, (hidden, cell))
+        return hidden, cell
 
     def _side_by_side(
         self, inputs: Float[Tensor, "batch agents inputs"], valid: Bool[Tensor, "batch agents"]

@@ -18,7 +18,7 @@ from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
 from predictor.graph import self_pairs
 from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
-from predictor.layers.rnn import Correction, masked_lstm
+from predictor.layers.rnn import Correction, full_precision, masked_lstm
 from predictor.noise import NoiseOfPairs, uniform_like
 
 NO_EDGE_LOGIT = -1e4
@@ -297,7 +297,9 @@ class Decoder(nn.Module):
     ) -> Float[Tensor, "*batch agents decoder"]:
         """Computes one GRU step for every agent."""
         width, axes = hidden.shape[-1], messages.shape[:-1]
-        after: Tensor = self.gru(messages.flatten(0, -2), hidden.expand(*axes, width).flatten(0, -2))
+        inputs = messages.flatten(0, -2).to(hidden.dtype)
+        with full_precision(inputs.device):
+            after: Tensor = self.gru(inputs, hidden.expand(*axes, width).flatten(0, -2))
         return after.unflatten(0, axes)
 
     def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:

@@ -48,7 +48,7 @@ def masked_lstm(
         Hidden and cell state after each step; views, whose memory has time first.
     """
     assert correct is None or not reverse  # corrections are computed for the steps in their order only
-    with _full_precision(gates.device):
+    with full_precision(gates.device):
         steps = list(zip(_steps(gates), _steps(pairs[..., None].to(gates.dtype)), strict=True))
         h, c = hidden.flatten(0, -2), cell.flatten(0, -2)
         hiddens, cells = [], []
@@ -81,11 +81,18 @@ def masked_gru(
     if not inputs.shape[1]:
         return hidden.new_zeros(len(hidden), 0, *hidden.shape[1:])
     states, state = [], hidden.flatten(0, -2)
-    with _full_precision(inputs.device):
+    with full_precision(inputs.device):
         for step, present in zip(_steps(inputs), _steps(valid[..., None].to(hidden.dtype)), strict=True):
             state = cell(step.to(hidden.dtype), state) * present
             states.append(state)
     return _sequence(states, hidden)
+
+
+def full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """Turns autocast off: rounding errors of recurrences add up over many steps, and CUDA's rounds their cells."""
+    if not torch.amp.is_autocast_available(device.type) or not torch.is_autocast_enabled(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
 
 
 def lstm_step_(
@@ -156,10 +163,3 @@ def _steps(sequence: Tensor) -> tuple[Tensor, ...]:
 def _sequence(steps: list[Tensor], like: Tensor) -> Tensor:
     """Joins steps, batch first in shape and time first in memory."""
     return torch.stack(steps).unflatten(1, like.shape[:-1]).transpose(0, 1)
-
-
-def _full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Turns autocast off: rounding errors of recurrences add up over many steps."""
-    if not torch.amp.is_autocast_available(device.type):
-        return nullcontext()
-    return torch.autocast(device.type, enabled=False)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor import train as training
@@ -150,6 +150,21 @@ def test_bfloat16_rounds_products_and_nothing_else(circles: Path, tmp_path: Path
     assert kinds[0] == {torch.float32} and torch.bfloat16 in kinds[1]
     assert outputs == [{torch.float32}] * 2
     assert losses[0] != losses[1] == pytest.approx(losses[0], rel=0.05)
+
+
+@pytest.mark.parametrize("model", [{"preset": "fast"}, {"preset": "plural"}, {"model": "lstm"}])
+def test_memories_stay_float32_in_bfloat16(circles: Path, tmp_path: Path, model: dict[str, Any]):
+    """On CUDA autocast rounds the cells of GRU and LSTM; on a CPU it does not, so what counts is that it is off."""
+    settings = config(circles, tmp_path, precision="bfloat16", **model)
+    trainer = Trainer(settings, load_data(settings))
+    seen = []
+    for cell in trainer.model.modules():
+        if isinstance(cell, nn.GRUCell | nn.LSTMCell):
+            cell.register_forward_hook(
+                lambda _, inputs, __: seen.append((torch.is_autocast_enabled("cpu"), inputs[0].dtype))
+            )
+    trainer.train_step()
+    assert set(seen) == {(False, torch.float32)}
 
 
 def test_tensor_cores_are_allowed_for_the_step_alone(circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
