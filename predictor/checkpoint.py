@@ -24,7 +24,7 @@ from predictor.scene import SceneSpec
 from predictor.scene_checks import MOST_STEPS
 from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
 from predictor.support.errors import UserError, short
-from predictor.support.files import check_place, new_folder, told_of, write_json
+from predictor.support.files import check_place, new_folder, told_of, write_bytes, write_json
 from predictor.support.hub import fetch, hub_name, is_hub
 from predictor.support.reading import MIB, NoSuchFile, check_regular, read_json, version_of
 from predictor.support.remote import address, is_remote, kept_copy, named
@@ -85,7 +85,7 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
     with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-        (partial / WEIGHTS).write_bytes(save(tensors))  # `save_file` would not follow the umask
+        write_bytes(partial / WEIGHTS, save(tensors))  # `save_file` would not follow the umask, nor flush
         write_json(partial / CONFIG, {"format": FORMAT, "version": VERSION, **asdict(info)})
         with told_of(path, partial):
             read_info(partial)

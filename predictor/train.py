@@ -36,7 +36,7 @@ from predictor.support.remote import address
 from predictor.support.runtime import tune
 from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import TrainConfig
-from predictor.training.curve import CURVE_FILE, KEYS, add_point
+from predictor.training.curve import CURVE_FILE, KEYS, add_point, read_curve
 from predictor.training.processes import ALONE, Group, LostProcessError, joined
 from predictor.training.trainer import LOG_EVERY, Trainer
 from predictor.training.training_data import load_data
@@ -115,6 +115,9 @@ def _take_folder(stack: ExitStack, config: TrainConfig, config_file: Path) -> No
     stack.enter_context(locked(config.out, "training"))
     _check_run_folder(config, config_file)  # another training may have come and gone
     delete_leftovers(config.out)  # of a run that was killed while it saved
+    read_curve(config.out / CURVE_FILE)  # a damaged one, or a damaged result, is told now, not at the next validation
+    if (config.out / BEST_OF_RUN).exists():
+        load_checkpoint(config.out / BEST_OF_RUN)
 
 
 def _follow(trainer: Trainer) -> None:

@@ -55,7 +55,7 @@ class ResidentWindows:
         sizes = np.cumsum([0, *(len(w) for w in windows)])
         self.offsets: tuple[int, ...] = tuple(int(s) for s in sizes[:-1])
         flat = join([w.flat for w in windows])
-        self._width = int(flat.columns.max())
+        self._width, self._longest = int(flat.columns.max()), int(flat.steps.max())
         episodes = np.cumsum([0, *(len(w.flat.steps) for w in windows)])
         index = np.concatenate([w.index + [shift, 0] for w, shift in zip(windows, episodes[:-1], strict=True)])
         self._episode, self._now = (torch.from_numpy(column).to(device) for column in index.T.copy())
@@ -72,10 +72,10 @@ class ResidentWindows:
 
         Args:
             indices: numbers of the windows, on the device.
-            history_steps: a shorter history than the longest one.
+            history_steps: a shorter history than the longest one; none is longer than the longest episode.
             time: number of steps of the result; None takes history plus horizon.
         """
-        history = history_steps or self.history_steps
+        history = min(history_steps or self.history_steps, self._longest)
         episode, now = self._episode.index_select(0, indices), self._now.index_select(0, indices)
         casts = cast(self._flat, episode, now, history, self._width, self.has_ego)
         steps = time or history + self.horizon_steps

@@ -58,6 +58,8 @@ def new_file(path: Path) -> Iterator[Path]:
 def new_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error.
 
+    What is written into it with `new_file` is on the disk before the folder is replaced; of other files a power cut may
+    leave an empty one.
     On another file system (`s3://…`) it is replaced file by file (`predictor.support.remote.uploaded`).
     """
     if is_remote(path):
@@ -70,6 +72,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         with disk_errors_of(path):
             yield partial
             _replace_folder(partial, path)
+            _flush(path.parent)
 
 
 @contextmanager

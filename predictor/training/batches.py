@@ -332,7 +332,8 @@ def open_batches(
             else HostBatches(windows, device, rows=rows)
         )
         return Source(batches, widths=widths if len(np.unique(agents)) > 1 else None)
-    shapes: Shapes | None = Shapes(int(agents.max()), config.history_steps, config.horizon_steps)
+    history = min(config.history_steps, max(int(w.flat.steps.max()) for w in windows))
+    shapes: Shapes | None = Shapes(int(agents.max()), history, config.horizon_steps)
     waste = padding_factor(agents, config.batch_size)
     notes = []
     if waste > MOST_PADDING:

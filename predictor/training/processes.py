@@ -60,7 +60,9 @@ class Group:
         """
         if not self.connected or not name.startswith("cuda"):
             return name
-        if ":" in name and self.count > 1:
+        if ":" in name:
+            if self.count == 1:
+                return name
             raise UserError(f"device '{name}' is one card for {self.count} processes; pass --device cuda")
         found = torch.cuda.device_count()
         if self.local >= found:
@@ -240,7 +242,8 @@ class RowsDropout(nn.Dropout):
             return input
         # torch draws in the order of the memory, which is not that of the axes in a permuted tensor
         strides = input.stride()
-        order = sorted(range(input.ndim), key=lambda axis: -strides[axis])
+        # of one row, the stride says nothing of where rows lie; beside a later axis, that one was first
+        order = sorted(range(input.ndim), key=lambda axis: (-strides[axis], axis == 0))
         shape = (self._total, *input.shape[1:])
         whole = input.new_ones([shape[axis] for axis in order]).permute(
             [order.index(axis) for axis in range(input.ndim)]

@@ -45,7 +45,7 @@ def read_state(path: Path, model: nn.Module, device: torch.device) -> dict[str, 
         raise _damaged(path, "step and stale must not be negative, and best a number, got "
                        f"{state['step']}, {state['stale']} and {state['best']}")  # fmt: skip
     _check_weights(path, state["model"], model)
-    _check_moments(path, state["optimizer"], model)
+    _check_moments(path, state["optimizer"], model, trained=state["step"] > 0)
     return state
 
 
@@ -58,11 +58,15 @@ def _check_weights(path: Path, weights: dict[Any, Any], model: nn.Module) -> Non
             raise _damaged(path, f"weight '{name}' is not finite")
 
 
-def _check_moments(path: Path, optimizer: dict[Any, Any], model: nn.Module) -> None:
+def _check_moments(path: Path, optimizer: dict[Any, Any], model: nn.Module, trained: bool) -> None:
     moments, parameters = optimizer.get("state"), list(model.parameters())
     groups = optimizer.get("param_groups")
     if not isinstance(moments, dict) or not isinstance(groups, list) or not all(isinstance(g, dict) for g in groups):
         raise _damaged(path, "'optimizer' must have a dict 'state' and a list 'param_groups'")
+    if [group.get("params") for group in groups] != [list(range(len(parameters)))]:
+        raise _damaged(path, "'optimizer' must have one group, of all weights in their order")
+    if trained and not moments:
+        raise _damaged(path, "'optimizer' has no moments, which each step leaves")
     for place, entry in moments.items():
         if not isinstance(entry, dict) or not set(_MOMENTS) <= entry.keys() or not _is_place(place, parameters):
             raise _damaged(path, f"'optimizer' must hold {', '.join(_MOMENTS)} of each weight")

@@ -181,6 +181,18 @@ def test_device_batches_give_the_same_windows(step: int, shapes: Shapes | None):
     assert_same(ours, expected)
 
 
+def test_no_history_is_longer_than_the_longest_episode():
+    """It was padded with as many steps as the option says, which no memory holds."""
+    config = replace(CONFIG, history_steps=2_000_000_000, min_history_steps=0)
+    stores = windows(config)
+    now = plan(config, [len(w) for w in stores], 0)
+    ours = DeviceBatches(ResidentWindows(stores, CPU), CPU).batch(now)
+    expected = HostBatches(stores, CPU).batch(now)
+    time, agents = expected.valid.shape[1:]
+    assert ours.valid.shape[1] <= 9 + config.horizon_steps
+    assert torch.equal(ours.states[:, :time, :agents], expected.states) and ours.valid.sum() == expected.valid.sum()
+
+
 @pytest.mark.parametrize("changes", [{}, {"min_history_steps": 1, "curriculum_steps": 4}], ids=["plain", "schedules"])
 def test_training_on_resident_data_is_training(tmp_path: Path, changes: dict[str, Any]):
     data = write_circles(tmp_path / "circles")
@@ -316,6 +328,14 @@ def test_data_that_must_go_to_the_device_and_does_not_fit_is_refused(card: Calla
     card(2**12)
     with pytest.raises(UserError, match=r"the windows need .* MiB on cpu and 0\.0 MiB are set aside for them"):
         open_batches(replace(CONFIG, data_device="device"), windows(), CUDA)
+
+
+def test_shapes_of_histories_beyond_the_episodes_are_those_of_the_longest(card: Callable[[int], None]):
+    card(2**20)
+    config = replace(CONFIG, history_steps=1000)
+    source = open_batches(config, windows(config), CUDA)
+    assert isinstance(source.batches, DeviceBatches) and source.batches.shapes is not None
+    assert source.batches.shapes.history_steps == max(int(w.flat.steps.max()) for w in windows(config)) < 12
 
 
 def test_shapes_stay_fixed_without_capturing(card: Callable[[int], None]):

@@ -113,7 +113,7 @@ def test_a_state_of_another_model_is_refused(circles: Path, tmp_path: Path):
     state = torch.load(tmp_path / "state", weights_only=True)
     state["optimizer"]["param_groups"] *= 2
     torch.save(state, tmp_path / "state")
-    with pytest.raises(UserError, match=r"state cannot be read \(zip\(\) argument"):
+    with pytest.raises(UserError, match=r"state cannot be read \('optimizer' must have one group"):
         trainer.restore(tmp_path / "state")
 
 
@@ -261,3 +261,27 @@ def test_precision_is_part_of_a_line_and_the_machine_is_not(tmp_path: Path, monk
         for s in (suite, replace(suite, precision="bfloat16"), replace(suite, device="cuda"), replace(suite, workers=1))
     ]
     assert folders[0] != folders[1] and folders[0] == folders[2] == folders[3]
+
+
+# --- Files that are damaged ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("curve.json", "{", "curve.json is damaged; remove it to go on without it"),
+        ("checkpoint/model.safetensors", "", r"model\.safetensors"),
+        ("checkpoint/config.json", "[]", r"config\.json"),
+    ],
+)
+def test_what_a_run_would_go_on_with_is_looked_at_first(
+    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: str, message: str
+):
+    """A finished run gave a broken checkpoint for its result; a damaged curve ended a run at its next validation."""
+    settings = config(circles, tmp_path / "run")
+    train(settings)
+    (tmp_path / "run" / name).write_text(content)
+    monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained"))
+    for steps in (settings.steps, settings.steps + 4):
+        with pytest.raises(UserError, match=message):
+            train(replace(settings, resume=True, steps=steps))

@@ -214,6 +214,21 @@ def test_dropout_of_rows_is_that_of_the_batch(order: tuple[int, ...]):
     assert torch.equal(RowsDropout(0.4, slice(0, 2), 6).eval()(whole[:2]), whole[:2])
 
 
+def test_dropout_of_one_row_is_that_of_the_batch():
+    """Steps are stacked with time first in memory, where the strides of a single row and of time are equal."""
+    steps = list(torch.randn(4, 3, 5))
+
+    def sequence(rows: slice) -> Tensor:
+        return torch.stack([step[rows] for step in steps]).transpose(0, 1)
+
+    torch.manual_seed(3)
+    expected = nn.Dropout(0.4)(sequence(slice(0, 3)))
+    for row in range(3):
+        torch.manual_seed(3)
+        rows = slice(row, row + 1)
+        assert torch.equal(RowsDropout(0.4, rows, 3)(sequence(rows)), expected[rows])
+
+
 def test_every_dropout_of_a_network_keeps_its_rows():
     network = nn.Sequential(nn.Linear(2, 2), nn.Sequential(nn.Dropout(0.3)), nn.Dropout(0.1))
     keep_rows_of_dropout(network, slice(0, 1), 2)
@@ -239,6 +254,7 @@ def test_each_process_has_a_card_of_its_own(monkeypatch: pytest.MonkeyPatch):
         Group(2, 3, 2, connected=True).device("cuda")
     with pytest.raises(UserError, match="device 'cuda:0' is one card for 2 processes; pass --device cuda"):
         Group(0, 2, 0, connected=True).device("cuda:0")
+    assert Group(0, 1, 0, connected=True).device("cuda:1") == "cuda:1"
 
 
 @dataclass(frozen=True)

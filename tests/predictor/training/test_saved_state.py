@@ -48,3 +48,24 @@ def test_damaged_moments_are_one_sentence(tmp_path: Path, place: Any, name: str,
     torch.save(state, tmp_path / "state.pt")
     with pytest.raises(UserError, match=f"state.pt cannot be read .*{message}.*; train anew into another --out"):
         read_state(tmp_path / "state.pt", model, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"state": {}}, "no moments, which each step leaves"),
+        ({"param_groups": [{"params": [1, 0]}]}, "one group, of all weights in their order"),
+        ({"param_groups": [{"params": [1000, 1001]}]}, "one group, of all weights in their order"),
+        ({"param_groups": []}, "one group, of all weights in their order"),
+    ],
+)
+def test_moments_of_nothing_or_of_others_are_refused(tmp_path: Path, change: dict[str, Any], message: str):
+    """Adam would begin anew, or take the moments of another weight, and the run would be another one."""
+    model, state = saved(tmp_path)
+    state["optimizer"] |= change
+    torch.save(state, tmp_path / "state.pt")
+    with pytest.raises(UserError, match=f"state.pt cannot be read .*{message}"):
+        read_state(tmp_path / "state.pt", model, torch.device("cpu"))
+    if not state["optimizer"]["state"]:
+        torch.save(state | {"step": 0}, tmp_path / "state.pt")
+        assert read_state(tmp_path / "state.pt", model, torch.device("cpu"))["step"] == 0
