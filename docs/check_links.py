@@ -52,13 +52,13 @@ def dead_links(site: Path) -> Iterator[str]:
         raise UserError(f"{site} must be the folder of a built site, but it has no .html file; run make docs")
     for path in pages:
         for line, link in _read(path).links:
-            missing = _missing(path, link)
+            missing = _missing(path, link, site.resolve())
             if missing:
                 yield f"{path.relative_to(site)}:{line}: {link}: {missing}"
 
 
-def _missing(page: Path, link: str) -> str:
-    """Returns what a link of a page lacks; empty for a good one and for one that leaves the site."""
+def _missing(page: Path, link: str, site: Path) -> str:
+    """Returns what a link of a page lacks; empty for a good one and for one to another host."""
     try:
         parts = urlsplit(link)
     except ValueError:
@@ -66,6 +66,8 @@ def _missing(page: Path, link: str) -> str:
     if parts.scheme or parts.netloc:
         return ""
     target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+    if not target.resolve().is_relative_to(site):
+        return "leaves the site"
     target = target / "index.html" if target.is_dir() else target
     if not target.is_file():
         return "no such file"

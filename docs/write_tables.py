@@ -106,7 +106,10 @@ def _sizes() -> str:
 
 def _transfer(records: Records) -> str:
     """Returns minADE₁ of each checkpoint (columns) in each environment (lines), and how far below constant velocity."""
-    measured = {(m.env_id, name): m for name, found in records.items() for m in found if m.samples == 1}
+    single = [(m.env_id, name, m) for name, found in records.items() for m in found if m.samples == 1]
+    measured = {(env_id, name): m for env_id, name, m in single}
+    if len(measured) < len(single):
+        raise UserError("transfer: a checkpoint has two measurements with K = 1 in one environment; keep one driver's")
     names = sorted({name for _, name in measured})
     lines = []
     for env_id in sorted({env_id for env_id, _ in measured}):

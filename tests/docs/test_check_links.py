@@ -37,11 +37,14 @@ def test_good_links_and_links_to_other_hosts_pass(site: Path, monkeypatch: pytes
         ('\n<img src="none.png">', "c.html:2: none.png: no such file"),
         ('<a href="sub/b.html#here">x</a>', "c.html:1: sub/b.html#here: b.html has no id 'here'"),
         ('<a href="http://[bad">x</a>', "c.html:1: http://[bad: no address"),
+        ('<a href="../outside.html">x</a>', "c.html:1: ../outside.html: leaves the site"),
+        ('<a href="/etc/hostname">x</a>', "c.html:1: /etc/hostname: leaves the site"),
         ('<a href="#here">x</a>', "c.html:1: #here: c.html has no id 'here'"),
     ],
 )
 def test_a_dead_link_is_named_with_its_place(site: Path, text: str, found: str, monkeypatch: pytest.MonkeyPatch):
     (site / "c.html").write_text(text)
+    (site.parent / "outside.html").write_text("a file beside the site, which is not served")
     assert list(check_links.dead_links(site)) == [found]
     monkeypatch.setattr("sys.argv", ["check_links", str(site)])
     with pytest.raises(UserError, match="1 dead links"):

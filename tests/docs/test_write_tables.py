@@ -1,6 +1,7 @@
 """The tables of README.md, docs/ and the cards are what the checkpoints' records say."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,12 @@ def test_a_missing_line_of_the_transfer_matrix_is_named():
     lacking = RECORDS | {"highway": [m for m in RECORDS["highway"] if (m.env_id, m.samples) != (env_id, 1)]}
     with pytest.raises(UserError, match=f"transfer to {env_id}: no measurement with K = 1 in the records of highway;"):
         write_tables.tables(lacking)
+
+
+def test_two_drivers_cannot_stand_in_one_line_of_the_transfer_matrix():
+    first = next(m for m in RECORDS["highway"] if m.samples == 1)
+    with pytest.raises(UserError, match="two measurements with K = 1 in one environment"):
+        write_tables.tables(RECORDS | {"highway": [*RECORDS["highway"], replace(first, driver="idle")]})
 
 
 def test_every_id_with_a_checkpoint_has_a_line():

@@ -43,7 +43,7 @@ class FuzzConfig:
 
 
 def run(config: FuzzConfig) -> tuple[int, list[Path]]:
-    """Fuzzes in a process of its own; returns the number of inputs that were tried, and the findings.
+    """Fuzzes in a process of its own; returns the number of inputs that were tried, and this run's findings.
 
     Raises:
         UserError: atheris is not installed, or the process said nothing.
@@ -63,9 +63,11 @@ def run(config: FuzzConfig) -> tuple[int, list[Path]]:
         str(grown),
     ]  # fmt: skip
     words = [sys.executable, "-m", "tests.fuzz.child", config.entry, str(found), *libfuzzer]
+    before = {path: path.stat().st_mtime_ns for path in found.iterdir()}
     said = subprocess.run(words, stderr=subprocess.PIPE, text=True, errors="replace", check=False).stderr
     tried = re.search(r"stat::number_of_executed_units:\s*(\d+)", said)
-    findings = sorted(path for path in found.iterdir() if path.suffix != ".txt")
+    changed = [path for path in found.iterdir() if path.stat().st_mtime_ns != before.get(path)]
+    findings = sorted(path for path in changed if path.suffix != ".txt")  # of this run, not of earlier ones
     if tried is None and not findings:
         raise UserError(f"the fuzzer ended early: {said[-1500:]}")
     return int(tried[1]) if tried else 0, findings

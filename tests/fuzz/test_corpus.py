@@ -65,3 +65,26 @@ def test_without_atheris_a_line_says_how_to_install_it(monkeypatch: pytest.Monke
 def test_the_command_says_what_is_wrong():
     done = subprocess.run([sys.executable, "-m", "tests.fuzz", "moon"], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "moon" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_findings_of_earlier_runs_are_not_counted_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Nor do they hide that the fuzzer ended before it tried anything."""
+    found = tmp_path / "json" / "findings"
+    found.mkdir(parents=True)
+    (found / "KeyError-old.bin").write_bytes(b"x")
+    said, new = "stat::number_of_executed_units: 5000", []
+
+    def child(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        for name in new:
+            (found / name).write_bytes(b"y")
+        return subprocess.CompletedProcess(words, 0, stderr=said)
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(subprocess, "run", child)
+    assert run(FuzzConfig("json", out=tmp_path)) == (5000, [])
+    new.append("KeyError-new.bin")
+    assert run(FuzzConfig("json", out=tmp_path)) == (5000, [found / "KeyError-new.bin"])
+    new.clear()
+    said = "ImportError"
+    with pytest.raises(UserError, match="the fuzzer ended early: ImportError"):
+        run(FuzzConfig("json", out=tmp_path))

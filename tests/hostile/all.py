@@ -112,6 +112,8 @@ def try_all(config: AllConfig) -> Counter[str]:
                         f"{verdict}: {trial.title!r} ({outcome.seconds:.1f} s): {' | '.join(last)[-400:]!r}", flush=True
                     )
     shutil.rmtree(name, ignore_errors=True)
+    if not counts:
+        raise UserError(f"of must begin the title of a trial, got '{config.of}'; leave it out to try all")
     return counts
 
 

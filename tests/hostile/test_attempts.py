@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from predictor.support.errors import ProtocolError, UserError, one_line, run_entry_point
+from tests.hostile import all as everything
 from tests.hostile import attempts, calls
 from tests.hostile.argued import ARGUED, reason_of
 from tests.hostile.attempts import Attempt
@@ -150,3 +151,11 @@ def test_a_line_that_does_not_name_what_is_wrong_is_not_clear():
     assert not is_clear("error: steps must be\nat least 1\n", ("steps",))
     assert not is_clear("Traceback (most recent call last)\n", ("",))
     assert not is_clear("error: \x1b[31mred\n", ("",))
+
+
+def test_a_beginning_that_no_title_has_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """A mistyped --of tried nothing, and passed."""
+    monkeypatch.setattr(everything, "REFUSED", ())
+    monkeypatch.setattr(everything, "write_inputs", lambda _: None)
+    with pytest.raises(UserError, match=r"of must begin the title of a trial, got 'predictor\.trian'"):
+        everything.try_all(everything.AllConfig(only=("numbers",), of="predictor.trian"))
