@@ -192,12 +192,19 @@ def _report_only(config: StudyConfig, folder: Path, study: Study, text: str) -> 
 def _all_results(folder: Path, study: Study) -> list[Result]:
     """Reads the results of a study's scenarios and arms, whatever version they are of; of two of one cell the later.
 
+    Those of other settings than the file's are left out, which a line says.
+
     Raises:
         UserError: one of them is damaged.
     """
     ids = {scenario.name: scenario.env_id for scenario in study.scenarios}  # a scenario's may have changed
     every = [read_result(file) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
     found = [each for each in every if each.env_id == ids.get(each.scenario)]
+    fitting = [each for each in found if _has_settings_of(each, study)]
+    if len(fitting) < len(found):
+        others = len(found) - len(fitting)
+        print(f"left out: {others} results of other settings than {study.name}'s file has now", file=sys.stderr)
+        found = fitting
     latest = {
         (each.scenario, each.arm, each.algorithm, each.seed): each
         for each in sorted(found, key=lambda each: str(each.provenance.get("time")))
@@ -206,6 +213,15 @@ def _all_results(folder: Path, study: Study) -> list[Result]:
     arms = list(itertools.product([arm.name for arm in study.arms], study.algorithms, study.training_seeds))
     cells = ((scenario.name, *line) for scenario in study.scenarios for line in (*drivers, *arms))
     return [latest[cell] for cell in cells if cell in latest]
+
+
+def _has_settings_of(result: Result, study: Study) -> bool:
+    """Returns whether a result is of the settings that the study's file has now, as far as the result says."""
+    scenario = next(scenario for scenario in study.scenarios if scenario.name == result.scenario)
+    arm = next((arm for arm in study.arms if arm.name == result.arm), None)
+    if result.settings is None or (arm is None and result.algorithm is not None):  # an arm that is gone
+        return True
+    return result.settings == study.settings_of(scenario, None if result.algorithm is None else arm, result.algorithm)
 
 
 def _run_missing(

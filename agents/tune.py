@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,11 @@ class TuneConfig:
     selection_episodes: int = 20
     """Number of episodes per such measurement."""
     checkpoint: str | None = None
-    """Forecaster whose shape the zeros have; None takes the checkpoint that ships for the env id."""
+    """Forecaster whose shape the zeros have; None takes the checkpoint that ships for the env id, and so does one of
+    one's own where one ships."""
+    checkpoint_every: int = 2_000
+    """Number of environment steps between the checkpoints of a training. Episodes end there, so `checkpoint_every /
+    num_envs` should be well above their length."""
     env_kwargs: str = ""
     """Arguments of the environment as a JSON object."""
     seed: int = 0
@@ -96,7 +100,7 @@ class TuneConfig:
         """
         check_choices(self)
         names = ("trials", "steps", "num_envs", "trainings", "episodes", "selections", "selection_episodes")
-        check_at_least(self, 1, *names)
+        check_at_least(self, 1, *names, "checkpoint_every")
         if not 0 <= self.seed < MAX_SEED:
             raise UserError(f"seed must lie in [0, {MAX_SEED}), got {self.seed}")
         if self.trainings > MAX_TRAININGS:
@@ -137,6 +141,7 @@ class TuneConfig:
             selections=self.selections,
             selection_episodes=self.selection_episodes,
             selection_envs=min(self.num_envs, os.cpu_count() or 1),
+            checkpoint_every=self.checkpoint_every,
             repeatable=True,
             settings=settings,
         )
@@ -300,10 +305,12 @@ def _check_folder(folder: Path, config: TuneConfig) -> None:
         converted(content.get("provenance", []), tuple[dict[str, Any], ...], f"{file}: provenance")
     except (UserError, KeyError) as error:
         raise UserError(f"{file} is damaged ({error}); remove {folder} or choose another --out") from error
+    defaults = {field.name: field.default for field in fields(TuneConfig)}  # of fields that are newer than the tuning
     for name, now in _settings_of_tuning(config).items():
-        if before.get(name) != now:
+        then = before.get(name, defaults.get(name))
+        if then != now:
             raise UserError(
-                f"cannot go on in {folder}: {name} was {before.get(name)!r}, now {now!r}; "
+                f"cannot go on in {folder}: {name} was {then!r}, now {now!r}; "
                 "pass the old value or choose another --out"
             )
 

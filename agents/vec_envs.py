@@ -192,8 +192,8 @@ def make_venv(
         num_envs: number of environments; of a PettingZoo environment the number of copies, each with one environment of
             the vector per learner.
         seeded: whether to wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
-        in_process: whether the environments of Gymnasium run in this process, else in spawned ones; None: one does,
-            several do not.
+        in_process: whether the environments of Gymnasium run in this process, else in spawned ones, and those of
+            EnvPool in one thread, else in as many as it takes; None: one of Gymnasium does, all others do not.
         shaping: whether rewards are shaped where those of the environment are rare (`agents.shaping`).
     """
     if task.is_multiagent:
@@ -207,6 +207,7 @@ def make_venv(
             scenes=spec is not None,
             perception_m=None if spec is None else spec.perception_m,
             max_agents=None if spec is None else spec.max_agents,
+            num_threads=1 if in_process else 0,
         )
     else:
         make = _MakeEnv(task, spec, seeded)

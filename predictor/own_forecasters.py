@@ -6,7 +6,7 @@ run's config alone must not bring one.
 """
 
 import importlib
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from predictor.forecaster import Forecaster, require_forecaster
@@ -45,6 +45,16 @@ def find_own(name: str) -> Any:
     return found
 
 
+def module_of(name: str) -> str:
+    """Returns the module that a name stands for.
+
+    Raises:
+        UserError: there is no such entry point.
+    """
+    module, colon, _ = name.removeprefix(PREFIX).partition(":")
+    return module if colon else _point(module).module
+
+
 def make_own(name: str, scene_spec: SceneSpec, source: str) -> Forecaster:
     """Makes the forecaster that a name stands for, for scenes of `scene_spec`.
 
@@ -71,14 +81,19 @@ def make_own(name: str, scene_spec: SceneSpec, source: str) -> Forecaster:
     return forecaster
 
 
-def _registered(name: str) -> Any:
+def _point(name: str) -> EntryPoint:
     known = {point.name: point for point in entry_points(group=GROUP)}
     if name not in known:
         raise UserError(
             f"no forecaster '{short(name)}' is registered; installed packages have {', '.join(known) or 'none'} (entry "
             f"points of the group {GROUP}); a function of a module is {PREFIX}module:function"
         )
+    return known[name]
+
+
+def _registered(name: str) -> Any:
+    point = _point(name)
     try:
-        return known[name].load()
+        return point.load()
     except (Exception, SystemExit) as error:
-        raise UserError(f"forecaster '{name}' cannot be imported from {known[name].value}: {named(error)}") from error
+        raise UserError(f"forecaster '{name}' cannot be imported from {point.value}: {named(error)}") from error

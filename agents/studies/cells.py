@@ -32,9 +32,10 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.content import content_of, content_of_module
-from envs.drivers.planner import is_planner, planner_checkpoint, planner_config
-from envs.registry import checkpoint_for
+from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint, planner_config
+from envs.registry import checkpoint_for, entry_for
 from envs.sb3.algorithms import CONTRIB
+from predictor.checkpoint import read_info, resolve
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers
@@ -74,6 +75,8 @@ class Cell:
     forecaster: Mapping[str, Any] | None
     """Pin of the forecaster whose forecasts are shown, or by which the planner drives, or of the policy that drives;
     None if there is none."""
+    settings: Mapping[str, Any] | None = None
+    """What the study's file says of the cell, for its result; no part of its name."""
 
     @property
     def algorithm(self) -> Algorithm | None:
@@ -201,6 +204,7 @@ def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
         trained_s,
         time.perf_counter() - began,
         made,
+        None if cell.settings is None else dict(cell.settings),
     )
     write_result(folder / RESULT_FILE, result)
     return result
@@ -220,7 +224,8 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
             many.close()
         else:
             names = checked_drivers(task, names)
-        return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task)) for name in names]
+        said = study.settings_of(scenario)
+        return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task), said) for name in names]
     except UserError as error:
         raise UserError(f"{place}: {error}") from error
 
@@ -250,7 +255,8 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
                 )
                 plan.check_spaces(*found)
                 shown = None if pin is None else asdict(pin)
-                cells.append(Cell(scenario.name, arm.name, task, plan, study.episodes, shown))
+                said = study.settings_of(scenario, arm, algorithm)
+                cells.append(Cell(scenario.name, arm.name, task, plan, study.episodes, shown, said))
     except UserError as error:
         raise UserError(f"{where}: scenario {scenario.name}, arm {arm.name}: {error}") from error
     return cells
@@ -268,6 +274,9 @@ def _driver_pin(name: str, task: Task) -> dict[str, Any] | None:
         return None
     settings = asdict(planner_config(name))
     checkpoint = planner_checkpoint(name) or checkpoint_for(task.env_id)
+    if checkpoint == ORACLE and (shipped := entry_for(task.env_id).checkpoint) is not None:
+        info = read_info(resolve(shipped))  # true futures are as long and as wide as its forecasts
+        settings["bounds"] = [info.horizon_steps, info.spec.max_agents, info.spec.perception_m]
     return {"sha256": content_of(f"planner:{checkpoint}") or checkpoint, **settings}
 
 

@@ -168,8 +168,9 @@ def _title(name: str, runs: Sequence[int]) -> str:
 
 def _references(findings: Findings, scenario: str) -> dict[str, float]:
     """Returns the mean returns of planner, heuristic and best constant action, by their names in the legend."""
+    planner = findings.planner(scenario)
     shown = {
-        "planner": findings.planner(scenario),
+        "planner" if planner is None else planner.arm: planner,
         "best constant action": findings.best_constant(scenario),
         "heuristic": findings.heuristic(scenario),
     }

@@ -153,8 +153,6 @@ class Study:
                 raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")
         for key, name in (("floor", self.floor), ("ceiling", self.ceiling)):
             self._arm_called(name, key)
-        if self.floor == self.ceiling:
-            raise UserError(f"floor and ceiling must be two arms, got '{self.floor}' for both")
 
     @property
     def training_seeds(self) -> tuple[int, ...]:
@@ -171,6 +169,27 @@ class Study:
         """Names of the arms that every other arm is compared with."""
         named = RIVALS if self.rivals is None else self.rivals
         return tuple(name for name in named if name in self.arm_names)
+
+    def settings_of(
+        self, scenario: Scenario, arm: StudyArm | None = None, algorithm: str | None = None
+    ) -> dict[str, Any]:
+        """Returns what the file says of a cell's result, as JSON content.
+
+        Args:
+            scenario: scenario of the cell.
+            arm: arm that is trained; None for a driver.
+            algorithm: learning algorithm; None for a driver.
+        """
+        unused = () if arm is not None and arm.observe != "none" else (*_OF_FORECASTS, "checkpoint")
+        options = {key: value for key, value in scenario.options.items() if key not in unused}
+        said: dict[str, Any] = {"scenario": options, "episodes": self.episodes}
+        if arm is not None:
+            names = ("selections", "selection_episodes", "checkpoint_every")
+            said |= {"observe": arm.observe, "arm": dict(arm.options), "steps": scenario.steps}
+            said |= {"num_envs": scenario.num_envs, "settings": dict(self.settings.get(algorithm or "", {}))}
+            said |= {name: getattr(self, name) for name in names}
+        content: dict[str, Any] = json.loads(json.dumps(said, default=str))
+        return content
 
     def headroom_only(self) -> "Study":
         """Returns the study with floor and ceiling alone, and of its references constant actions and planners.
@@ -236,14 +255,18 @@ def read_study(path: Path) -> Study:
     study = from_table(Study, content, where, given)
     scenarios = tuple(_scenario(name, table, study, f"{where}: scenarios.{name}") for name, table in tables.items())
     plans_alone = "ceiling" not in content and all(scenario.options.get("what_if") for scenario in scenarios)
-    return replace(study, scenarios=scenarios, ceiling=CEILING_OF_PLANS if plans_alone else study.ceiling)
+    ceiling = CEILING_OF_PLANS if plans_alone else study.ceiling
+    if study.floor == ceiling:
+        raise UserError(f"{where}: floor and ceiling must be two arms, got '{ceiling}' for both")
+    return replace(study, scenarios=scenarios, ceiling=ceiling)
 
 
 def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     """Returns the task of an arm in a scenario.
 
     A scenario's checkpoint goes to the arms that take one and name none of their own; what it says of forecasts, to the
-    arms that are shown any. All of these have the sizes of the scenario's checkpoint, or of the one that ships.
+    arms that are shown any. All of these have the sizes of the scenario's checkpoint, or of the one that ships, where
+    the scenario's has none: constant velocity, or a forecaster of one's own.
 
     Raises:
         UserError: the options of arm and scenario do not fit together; the message begins with `where`.
@@ -251,12 +274,12 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     places = {"scenario": scenario.name, "env_id": scenario.env_id}
     options = {key: _filled(value, places) for key, value in arm.options.items()}
     shared = dict(scenario.options)
-    sizes_of = shared.get("checkpoint") or entry_for(scenario.env_id).checkpoint
+    named = (shared.get("checkpoint"), entry_for(scenario.env_id).checkpoint)
+    sizes_of = next((name for name in named if name and name != CONSTANT_VELOCITY and not is_own(name)), None)
     if arm.observe in NO_CHECKPOINT:
         shared.pop("checkpoint", None)
     own = {**shared, **options}.get("checkpoint")
-    has_sizes = not is_own(sizes_of) and sizes_of != CONSTANT_VELOCITY
-    if has_sizes and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
+    if sizes_of and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
         shared.setdefault("sizes_of", sizes_of)
     if arm.observe == "none":
         shared = {key: value for key, value in shared.items() if key not in _OF_FORECASTS}

@@ -12,6 +12,7 @@ from agents.results import NOT_REPORTED
 from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
+from envs.drivers.planner import ORACLE, PLANNER
 from predictor.reports.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from predictor.support.files import write_text
 
@@ -215,7 +216,8 @@ def _return_of(findings: Findings, scenario: str, line: Line | None) -> str:
     if line is None:
         return NOTHING
     value = interval(findings.mean_return(scenario, line))
-    return f"{line.arm}: {value}" if line == findings.best_constant(scenario) else value
+    named = line.algorithm is None and line.arm not in (PLANNER, f"{PLANNER}:{ORACLE}")  # the headings say these
+    return f"{line.arm}: {value}" if named else value
 
 
 def _all_scenarios(findings: Findings) -> list[Block]:

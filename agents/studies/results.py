@@ -46,6 +46,8 @@ class Result:
     """Time of the test episodes [s]."""
     provenance: dict[str, Any]
     """Command, commit, versions, time."""
+    settings: dict[str, Any] | None = None
+    """What the study's file said of the cell (`Study.settings_of`); None in results of earlier versions."""
 
 
 def write_result(path: Path, result: Result) -> None:

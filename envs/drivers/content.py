@@ -6,7 +6,7 @@ from pathlib import Path
 
 from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
-from predictor.own_forecasters import PREFIX, is_own
+from predictor.own_forecasters import is_own, module_of
 
 
 def content_of(driver: str) -> str | None:
@@ -35,8 +35,7 @@ def _file_of(driver: str) -> Path | None:
         return Path(driver)
     planned = planner_checkpoint(driver) if is_planner(driver) else ""
     if is_own(driver) or is_own(planned):
-        module, colon, _ = (planned or driver).removeprefix(PREFIX).partition(":")
-        return _file_of_module(module) if colon else None
+        return _file_of_module(module_of(planned or driver))
     return None if planned in ("", ORACLE, CONSTANT_VELOCITY) else resolve(planned) / WEIGHTS
 
 

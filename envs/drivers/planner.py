@@ -13,24 +13,25 @@ equal ones that with the highest value, then the first.
 
 import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from jaxtyping import Float
 
-from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
+from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
 from envs.plans.contact import contacts
 from envs.plans.playing import as_forecast, with_true_futures
 from envs.readers import reader_for
-from envs.readers.base import SceneReader, show
+from envs.readers.base import SceneReader, bounded_spec, perceive, show
 from envs.registry import entry_for
 from envs.wrappers import SceneObservation, scene_source
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
-from predictor.forecaster import Forecaster, has_scale
+from predictor.forecaster import Forecaster, has_scale, require_forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_types
 from predictor.support.errors import UserError
 
 PLANNER = "planner"
@@ -40,6 +41,7 @@ ORACLE = "oracle"
 """Name in the place of a checkpoint: the planner gets the true futures, an upper bound for measurements."""
 MODES = 20
 """Number of futures of a forecaster with modes; others give the planner their single forecast."""
+_DEMAND = "plan_model must be None,"
 EQUAL = 1e-6
 """Largest difference of values or risks that are taken for equal: float32 forecasts have no more digits."""
 
@@ -58,7 +60,8 @@ class PlannerConfig:
     """Whether the futures are those that a copy of the simulator plays, instead of the forecaster's."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
+        """Checks types and ranges."""
+        check_types(self)
         check_at_least(self, 1, "num_samples", "horizon_steps")
         if not 0 <= self.max_risk <= 1:
             raise UserError(f"max_risk must be from 0 to 1, got {self.max_risk}")
@@ -139,7 +142,8 @@ class Planner:
 
     Args:
         env: environment that was reset or will be; a scene reader must know it, unless it is in `SceneObservation`.
-        forecaster: forecaster of the other agents.
+            There the planner perceives what both the wrapper's reader and the forecaster do.
+        forecaster: forecaster of the other agents, or the name or path of a checkpoint.
         plan_model: source of the candidate plans, with rewards; None takes the environment's.
         rng: source of the samples' noise.
         config: settings.
@@ -157,7 +161,7 @@ class Planner:
     def __init__(
         self,
         env: gym.Env,
-        forecaster: Forecaster,
+        forecaster: Forecaster | str | Path,
         plan_model: PlanModel | None = None,
         rng: np.random.Generator | None = None,
         config: PlannerConfig | None = None,
@@ -165,7 +169,9 @@ class Planner:
         """Starts with an empty history."""
         self.config = config or PlannerConfig()
         self.env = env
-        self.plan_model = plan_model or plan_model_for(env)
+        self.plan_model = plan_model_for(env) if plan_model is None else checked_model(plan_model, _DEMAND)
+        named = isinstance(forecaster, str | Path)
+        forecaster = forecaster_for(env, str(forecaster)) if named else require_forecaster(forecaster)
         trained = forecaster.spec
         self._own_reader = not env.has_wrapper_attr("scene_spec")
         self._reader: SceneReader = (
@@ -173,7 +179,10 @@ class Planner:
             if self._own_reader
             else env.get_wrapper_attr("reader")
         )
-        self._spec = self._reader.spec
+        read = self._reader.spec
+        self._spec = bounded_spec(
+            read, min(read.perception_m, trained.perception_m), min(read.max_agents, trained.max_agents)
+        )
         trained.check_compatible(self._spec, "the planner's forecaster", f"env '{scene_source(env)}'")
         self._online = OnlineForecaster(forecaster, 1, self._spec.max_agents)
         self._samples = self.config.num_samples or (MODES if has_scale(forecaster) else 1)
@@ -215,7 +224,7 @@ class Planner:
             show(self._reader, obs)
             return self._reader.read(self.env)
         scene: Scene = self.env.get_wrapper_attr("scene")
-        return scene
+        return scene if self._spec == self._reader.spec else perceive(scene, self._spec)
 
 
 def _below_scenes(env: gym.Env) -> gym.Env:

@@ -50,16 +50,19 @@ class PlanModel(Protocol):
         """Returns the plans from the environment's present state, which it must not change."""
 
 
-def checked_model(model: Any) -> PlanModel:
+def checked_model(model: Any, demand: str = "what_if must be True, False,") -> PlanModel:
     """Returns what was given as a plan model.
+
+    Args:
+        model: what was given.
+        demand: beginning of the sentence that says what is needed.
 
     Raises:
         UserError: it is none, or its plans have no names, or the same ones.
     """
     if not callable(getattr(model, "plans", None)) or not hasattr(model, "names"):
         raise UserError(
-            f"what_if must be True, False, or an object with names and plans(env, horizon_steps), got {model!r}; "
-            "see docs/what_if.md"
+            f"{demand} or an object with names and plans(env, horizon_steps), got {model!r}; see docs/what_if.md"
         )
     names = model.names
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names) or not names:

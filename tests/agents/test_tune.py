@@ -237,6 +237,14 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path, monkeypatch: pyte
     tune(config(tmp_path / "tuned", trials=2))
     with pytest.raises(UserError, match="cannot go on in .*: steps was 12, now 13; pass the old value or choose"):
         tune(config(tmp_path / "tuned", steps=13))
+    with pytest.raises(UserError, match="checkpoint_every was 2000, now 77; pass the old value"):
+        tune(config(tmp_path / "tuned", checkpoint_every=77))
+    file = tmp_path / "tuned" / "tuning.json"
+    earlier = json.loads(file.read_text())
+    del earlier["config"]["checkpoint_every"]  # of a version without
+    file.write_text(json.dumps(earlier))
+    tune(config(tmp_path / "tuned", trials=2))
+    assert config(tmp_path, checkpoint_every=77).plan({}, 0).checkpoint_every == 77
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("")
     with pytest.raises(UserError, match=r"holds notes.txt but no tuning \(tuning.json\); choose another --out"):

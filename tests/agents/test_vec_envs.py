@@ -12,6 +12,7 @@ from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, SeededEpisodes, make_venv
 from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
+from envs.sb3 import envpool as envpool_module
 from predictor.support.errors import UserError
 
 
@@ -227,6 +228,18 @@ def test_environments_observe_what_the_task_says():
     assert isinstance(forecast.observation_space, gym.spaces.Dict)
     assert {"observation", "agents", "forecast", "valid"} <= set(forecast.observation_space)
     forecast.close()
+
+
+@pytest.mark.parametrize(("in_process", "threads"), [(True, 1), (None, 0)])
+def test_where_a_process_is_to_have_one_thread_envpool_takes_one(
+    monkeypatch: pytest.MonkeyPatch, in_process: bool | None, threads: int
+):
+    """Else every cell of a study had as many as the machine has cores."""
+    pytest.importorskip("envpool")
+    asked, made = list[int](), envpool_module.make_pool
+    monkeypatch.setattr(envpool_module, "make_pool", lambda *a, **k: asked.append(a[2]) or made(*a, **k))
+    make_venv(Task("highway-fast-v0", "none", backend="envpool"), 3, in_process=in_process).close()
+    assert asked == [threads]
 
 
 def test_envpool_environments_observe_what_gymnasium_environments_do():

@@ -11,6 +11,7 @@ from agents.studies.plan import read_study
 from envs.drivers.content import content_of_module
 from envs.drivers.planner import PlannerConfig
 from envs.registry import make_env
+from predictor.checkpoint import read_info, resolve
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
 
@@ -165,6 +166,17 @@ def test_the_planners_settings_are_in_the_name(cells: Callable[..., list[Cell]],
     monkeypatch.setattr("agents.studies.cells.planner_config", lambda _: PlannerConfig(max_risk=0.7))
     changed = {title for title, name in names().items() if name != before[title]}
     assert changed == {"corridor, planner", "corridor, planner:oracle", "corridor, planner@0.3"}
+
+
+def test_how_far_true_futures_reach_is_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
+    """They are as long and as wide as those of the checkpoint that ships."""
+    text = {"env_id": HIGHWAY, "seeds": "1", "arms": '["none"]', "references": '["planner:oracle"]'}
+    before = cells(**text)[0].name
+    info = read_info(resolve("highway"))
+    assert cells(**text)[0].name == before
+    for other in (replace(info, horizon_steps=9, std_m=()), replace(info, spec=replace(info.spec, perception_m=50.0))):
+        monkeypatch.setattr("agents.studies.cells.read_info", lambda _, other=other: other)
+        assert cells(**text)[0].name != before
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -61,12 +61,16 @@ def test_a_checkpoint_of_a_scenario_goes_to_every_arm_that_takes_one(tmp_path: P
     assert task.checkpoint == (None if arm in ("none", "constant-velocity") else "shared")
 
 
-def test_constant_velocity_as_checkpoint_of_a_scenario_gives_no_sizes(tmp_path: Path):
-    text = study_text(arms='["zeros", "forecast"]')
-    own = 'env_id = "merge-v1"\ncheckpoint = "constant-velocity"\n'
+@pytest.mark.parametrize("checkpoint", ["constant-velocity", "own:mine:make"])
+def test_a_checkpoint_without_sizes_leaves_all_arms_those_of_the_shipped_one(tmp_path: Path, checkpoint: str):
+    """The arm that shows it had the sizes of what it shows, and so another network than its controls."""
+    text = study_text(arms='["zeros", "constant-velocity", "forecast"]')
+    own = f'env_id = "merge-v1"\ncheckpoint = "{checkpoint}"\n'
     study = read_study(study_path(tmp_path, text.replace(text[text.rindex("env_id") :], own)))
     tasks = [task_for(study.scenarios[0], arm, "file") for arm in study.arms]
-    assert [(task.checkpoint, task.sizes_of) for task in tasks] == [("constant-velocity", None)] * 2
+    assert [(task.checkpoint, task.sizes_of) for task in tasks] == [
+        (checkpoint, "merge"), (None, "merge"), (checkpoint, "merge"),
+    ]  # fmt: skip
 
 
 def test_arms_with_forecasters_of_their_own_have_the_sizes_of_the_others(tmp_path: Path):
@@ -87,6 +91,39 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
     assert (none.what_if, none.perception_m, zeros.what_if, zeros.perception_m) == (False, None, True, 9.0)
     with pytest.raises(UserError, match="arm none: what_if has no effect with observe=none"):
         task_for(study.scenarios[0], StudyArm("none", "none", {"what_if": True}), "file")
+
+
+def test_the_ceiling_of_plans_may_stand_over_true_futures_as_floor(tmp_path: Path):
+    text = study_text(floor='"oracle"')
+    own = 'env_id = "highway-fast-v0"\nwhat_if = true\n'
+    study = read_study(study_path(tmp_path, text.replace(text[text.rindex("env_id") :], own)))
+    assert (study.floor, study.ceiling) == ("oracle", "oracle-what-if")
+    with pytest.raises(UserError, match="floor and ceiling must be two arms, got 'oracle' for both"):
+        read_study(study_path(tmp_path, text))
+
+
+def test_what_the_file_says_of_a_cell_is_what_changes_its_result(tmp_path: Path):
+    arms = '["none", "zeros"]'
+    text = study_text(arms=arms)
+    own = 'env_id = "highway-fast-v0"\nnum_samples = 6\n'
+    text = text.replace(text[text.rindex("env_id") :], own)
+
+    def said(text: str) -> list[dict[str, Any]]:
+        study = read_study(study_path(tmp_path, text))
+        (scenario,) = study.scenarios
+        lines = [study.settings_of(scenario, arm, "ppo") for arm in study.arms]
+        return [study.settings_of(scenario), *lines]
+
+    before = said(text)
+    assert said(text) == before and before[0] != before[1] != before[2]
+
+    def changed(other: str) -> list[bool]:
+        return [now != then for now, then in zip(said(other), before, strict=True)]
+
+    assert changed(text.replace("num_samples = 6", "num_samples = 7")) == [False, False, True]
+    assert changed(text + 'env_kwargs = "{\\"config\\": {\\"vehicles_density\\": 3}}"\n') == [True, True, True]
+    assert changed(text + "steps = 77\n") == [False, True, True]
+    assert changed(study_text(arms=arms, episodes="7") + own[own.index("num") :]) == [True, True, True]
 
 
 @pytest.mark.parametrize(

@@ -243,6 +243,15 @@ def test_headroom_alone(tmp_path: Path):
     assert "## Provenance" in (tmp_path / "headroom.md").read_text()
 
 
+def test_a_planner_that_is_not_what_its_column_says_is_named(tmp_path: Path):
+    found = [replace(r, arm="planner:constant-velocity") if r.arm == "planner" else r for r in results()]
+    found.append(result("planner@0.1:oracle", [9.0, 9.0]))
+    text = write_headroom(tmp_path, found_in(study(), found), MADE)
+    assert "| planner:constant-velocity: 7.00" in text and "| planner@0.1:oracle: 9.00" in text
+    found[-1] = result("planner:oracle", [9.0, 9.0])
+    assert "planner:oracle: " not in write_headroom(tmp_path, found_in(study(), found), MADE)
+
+
 def test_intervals_as_text():
     assert interval(Estimate(0.25, 0.1, 0.4), 0, 100.0, " %") == "25 % (10 to 40)"
     assert interval(Estimate(-1.0, -2.0, 0.5), 1) == "−1.0 (−2.0 to 0.5)"

@@ -18,6 +18,7 @@ import pyarrow.parquet as parquet
 import pytest
 
 import agents.study
+from agents.studies.plan import read_study
 from agents.studies.pool import run_cells
 from agents.studies.results import write_result
 from agents.study import StudyConfig, run_study
@@ -360,6 +361,35 @@ def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
     report = (tmp_path / "out" / "report.md").read_text()
     assert "Not run yet: 1 cells" in report and "Commits of the results: 2 of old, 1 of new." in report
     assert "study.before.toml" in capsys.readouterr().err
+
+
+def test_the_report_alone_leaves_out_results_of_other_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Of other steps, another environment or other episodes; they stood beside those of the file as if equal."""
+    text = study_text(seeds="2", env_id="merge-v1")
+    run = replace(config(tmp_path, text), report=True)
+    before = read_study(study_path(tmp_path, text.replace("steps = 512", "steps = 1024")))
+    study = read_study(study_path(tmp_path, text))
+    monkeypatch.setattr("agents.study.run_cells", lambda *_: pytest.fail("nothing is run"))
+    ours, theirs = (of.settings_of(of.scenarios[0], of.arms[0], "ppo") for of in (study, before))
+    result = partial(studies.result, env_id="merge-v1", scenario="corridor")
+    made = [
+        result("none", [2.0], seed=0, settings=ours, provenance={"time": "2026-01"}),
+        result("none", [9.0], seed=0, settings=theirs, provenance={"time": "2026-02"}),
+        result("none", [9.0], seed=1, settings=theirs),
+        result("random", [1.0], settings=study.settings_of(study.scenarios[0])),
+        result("gone", [5.0], seed=0, settings=theirs),
+    ]
+    for i, each in enumerate(made):
+        (tmp_path / "out" / "cells" / str(i)).mkdir(parents=True)
+        write_result(tmp_path / "out" / "cells" / str(i) / "result.json", each)
+    (tmp_path / "out" / "study.toml").write_text(text)
+    assert run_study(run) == 0
+    episodes = parquet.read_table(tmp_path / "out" / "episodes.parquet").to_pylist()
+    assert [(e["arm"], e["seed"], e["return"]) for e in episodes] == [("random", None, 1.0), ("none", 0, 2.0)]
+    assert "left out: 2 results of other settings than corridor's file has now" in capsys.readouterr().err
+    assert "Not run yet: 1 cells" in (tmp_path / "out" / "report.md").read_text()
 
 
 @pytest.mark.parametrize("other", [{"scenarios": ("corridor",)}, {"seeds": 1}, {"cluster": "auto"}])

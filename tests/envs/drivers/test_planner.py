@@ -1,5 +1,6 @@
 """The planner takes the best plan within its risk, ties and "all too risky" by rule, and drives highway-env."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -23,6 +24,7 @@ from envs.readers.entities import EntityRowsReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import load_checkpoint
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -211,6 +213,46 @@ def test_environments_and_models_that_do_not_fit_are_refused():
         Planner(env, ConstantVelocity(ROAD), WithoutRewards())()
     with pytest.raises(UserError, match="max_risk must be from 0 to 1, got 1.5"):
         PlannerConfig(max_risk=1.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (lambda env, f: Planner(env, (f, "info")), "a forecaster needs spec, .*but tuple has no spec"),
+        (lambda env, f: Planner(env, "absent"), "no checkpoint 'absent'"),
+        (lambda env, f: Planner(env, f, True), "plan_model must be None, or an object with names and plans"),
+        (lambda env, f: Planner(env, f, config=PlannerConfig(max_risk="0.1")), "max_risk must be a number, got '0.1'"),  # type: ignore[arg-type]
+        (lambda env, f: Planner(env, f, config=PlannerConfig(horizon_steps=2.5)), "horizon_steps must be .*, got 2.5"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_a_planner_is_not_made_of_is_one_sentence(given: Any, message: str):
+    with pytest.raises(UserError, match=message):
+        given(make_env("highway-fast-v0"), ConstantVelocity(ROAD))
+
+
+def test_a_planner_takes_the_name_of_a_checkpoint():
+    env = make_env("highway-fast-v0")
+    env.reset(seed=0)
+    by_name, loaded = Planner(env, "highway"), Planner(env, load_checkpoint("highway")[0])
+    assert by_name() == loaded() and np.array_equal(by_name.survival, loaded.survival)
+
+
+def test_in_a_wrapper_the_planner_perceives_no_more_than_its_forecaster_was_trained_with():
+    """Else one driver's name is two drivers: alone in an environment, and where scenes are recorded."""
+    narrow = ConstantVelocity(replace(ROAD, perception_m=30.0, max_agents=3))
+    seen, survivals = [], []
+    for wrap in (lambda env: env, SceneObservation, lambda env: SceneObservation(env, perception_m=20.0)):
+        env = wrap(make_env("highway-fast-v0"))
+        env.reset(seed=0)
+        driver = Planner(env, narrow)
+        for _ in range(3):
+            env.step(driver())
+        seen.append((driver._spec.perception_m, driver._spec.max_agents))
+        survivals.append(driver.survival)
+    assert seen == [(30.0, 3), (30.0, 3), (20.0, 3)]
+    np.testing.assert_array_equal(survivals[0], survivals[1])
+    wide = Planner(SceneObservation(make_env("highway-fast-v0")), ConstantVelocity(ROAD))
+    assert (wide._spec.perception_m, wide._spec.max_agents) == (ROAD.perception_m, ROAD.max_agents)
 
 
 class Rows(gym.Env):
