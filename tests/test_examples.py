@@ -315,7 +315,9 @@ def test_the_plan_model_of_the_example_is_short_and_the_one_of_the_page():
     assert len([line for line in code.splitlines() if line]) <= 20
 
 
-def test_the_example_plans_what_the_robot_then_does():
+@pytest.mark.parametrize("robot", [[0.0, -4.0, 0.0, 0.5], [1.0, 0.0, 1.7, -0.5], [-7.9, -5.0, -0.9, 0.0]])
+def test_the_example_plans_what_the_robot_then_does(robot: list[float]):
+    """Also when it drifts sideways, which its first action ends in part, and at the walls."""
     from crossing_plans import CrossingPlans
 
     importlib.import_module("crossing_reader")
@@ -323,12 +325,14 @@ def test_the_example_plans_what_the_robot_then_does():
     for plan, name in enumerate(model.names):
         env = gym.make("Crossing-v0")
         env.reset(seed=1)
-        env.unwrapped.robot[1:] = [-4.0, 0.0, 0.5]  # type: ignore[attr-defined]  # away from the wall
+        env.unwrapped.robot[:] = robot  # type: ignore[attr-defined]
         plans = checked_plans(model, env, horizon, 4)
         assert plans.rewards is not None
         for step in range(horizon):
-            _, reward, *_ = env.step(plans.actions[plan])
-            np.testing.assert_allclose(env.unwrapped.robot, plans.states[plan, step], atol=1e-9, err_msg=name)  # type: ignore[attr-defined]
+            sideways = env.unwrapped.robot[2]  # type: ignore[attr-defined]
+            action = plans.actions[plan] if step == 0 else np.array([-sideways, plans.actions[plan][1]]).clip(-1, 1)
+            _, reward, *_ = env.step(action)
+            np.testing.assert_allclose(env.unwrapped.robot, plans.states[plan, step], atol=1e-6, err_msg=name)  # type: ignore[attr-defined]
             assert reward == pytest.approx(plans.rewards[plan, step])
 
 

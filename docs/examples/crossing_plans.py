@@ -14,9 +14,13 @@ class CrossingPlans:
 
     def plans(self, env, horizon_steps):
         """Returns states, first actions, and what the environment's reward would be."""
-        x, y, vx, vy = env.unwrapped.robot
-        push = np.array([0.0, -1.0, 1.0])
-        v = np.clip(vy + push[:, None] * DT_S * np.arange(1, horizon_steps + 1), -2.0, 2.0)
-        states = np.stack([np.full_like(v, x), y + np.cumsum(v * DT_S, axis=1), 0 * v, v], axis=-1)
-        actions = tuple(np.array([-vx, p], dtype=np.float32).clip(-1, 1) for p in push)
-        return Plans(states, actions, rewards=v * DT_S, crash_rewards=np.full_like(v, -10.0), size_m=(0.5, 0.5))
+        state, push, path = np.tile(env.unwrapped.robot, (3, 1)), np.array([0.0, -1.0, 1.0]), []
+        actions = tuple(np.array([-state[0, 2], p], dtype=np.float32).clip(-1, 1) for p in push)
+        for _ in range(horizon_steps):  # sideways it comes to rest, as by these actions
+            change = np.stack([np.clip(-state[:, 2], -1, 1), push], axis=1)
+            state[:, 2:] = np.clip(state[:, 2:] + change * DT_S, -2, 2)
+            state[:, :2] = np.clip(state[:, :2] + state[:, 2:] * DT_S, [-8, -5], [8, 5])
+            path.append(state.copy())
+        states = np.stack(path, axis=1)
+        rewards = states[..., 3] * DT_S
+        return Plans(states, actions, rewards, np.full_like(rewards, -10.0), size_m=(0.5, 0.5))
