@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from predictor.evaluation.causal_graph import (
+    RANKING_DRAWS,
     BINS,
     CausalPairs,
     average_precision,
@@ -15,7 +16,7 @@ from predictor.evaluation.causal_graph import (
     score_rule,
     spearman,
 )
-from predictor.evaluation.standard_errors import Estimate
+from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, central_interval
 
 metrics = pytest.importorskip("sklearn.metrics")
 
@@ -163,6 +164,16 @@ def test_intervals_are_over_episodes():
     assert found.auc is not None and found.auc.interval == (0.0, 1.0)
     alike = score_rule(np.tile([1.0, 0.0], 4), pairs(exists, np.repeat([0, 1, 2, 3], 2)), 0.5)
     assert alike.auc == Estimate(1.0, (1.0, 1.0))
+
+
+def test_the_interval_of_a_ranking_is_of_the_draws_alone():
+    rng = np.random.default_rng(5)
+    episode, exists = np.repeat(range(6), 8), rng.random(48) < 0.4
+    score = rng.random(48) + 0.5 * exists
+    found = score_rule(score, pairs(exists, episode), 0.5).auc
+    half = episode >= 3  # what is measured on
+    draws = bootstrap_draws(3, draws=RANKING_DRAWS).astype(np.float64)[:, episode[half] - 3]
+    assert found is not None and found.interval == central_interval(roc_auc(score[half], exists[half], draws))
 
 
 def test_what_rests_on_one_episode_has_no_interval():
