@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from predictor.evaluation.causal_graph import (
-    RANKING_DRAWS,
     BINS,
+    RANKING_DRAWS,
     CausalPairs,
     average_precision,
     best_bound,
