@@ -184,8 +184,11 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
     """Returns the folder of a line's run and result; another config or other data give another folder."""
     table, sizes = TABLES[config.table], config.sizes
     steps = [table.protocol.burn_in_steps, table.protocol.horizon_steps]
+    row: dict[str, Any] = {"model": line.model, "residual_of": line.residual_of, "overlap_m": table.overlap_m}
+    if table.overlap_of != "agents":  # results in which the ball was a player are measured anew
+        row["overlap_of"] = table.overlap_of
     content: dict[str, Any] = {
-        "row": {"model": line.model, "residual_of": line.residual_of, "overlap_m": table.overlap_m},
+        "row": row,
         "measuring": MEASURING,
         "protocol": [*steps, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [content_id(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
@@ -311,6 +314,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         "num_samples": NUM_SAMPLES,
         "seeds": config.seeds,
         "overlap_m": table.overlap_m,
+        "overlap_of": table.overlap_of,
         "wall_seconds_this_call": time.perf_counter() - began,
         "train_seconds": sum(line["train_seconds"] for line in lines),
         "rows": lines,

@@ -240,8 +240,10 @@ def _find_fault(path: Path, header: list[str], names: tuple[str, ...], columns: 
     filled = 0
     for number, text in enumerate(read_lines(path)[1:], start=2):
         words = text.split(",")
-        if not text.strip():
+        if not text:
             continue
+        if not text.strip():
+            return bad_line(path, number, "it holds only blanks", "delete it")
         filled += 1
         if len(words) <= max(columns):
             return bad_line(path, number, f"expected {len(header)} columns, got {len(words)}")
@@ -254,7 +256,7 @@ def _find_fault(path: Path, header: list[str], names: tuple[str, ...], columns: 
 
 def _line_of(path: Path, place: int) -> int:
     """Returns the line number in the file of an entry of the table; blank lines are not entries."""
-    filled = [number for number, text in enumerate(read_lines(path)[1:], start=2) if text.strip()]
+    filled = [number for number, text in enumerate(read_lines(path)[1:], start=2) if text]
     return filled[place]
 
 

@@ -10,6 +10,8 @@ from predictor.data.store import Episode
 from predictor.support.errors import UserError
 from predictor.support.memory import check_memory
 
+FAR_M = 10_000.0
+"""Files whose mean position is farther than half of this from zero are moved by a multiple of it [m]."""
 MOST_STEPS = 5_000_000
 """Largest number of steps from the first point of a recording to its last."""
 
@@ -53,6 +55,15 @@ def with_velocities(
     follows = np.flatnonzero((np.diff(tracks) == 0) & (np.diff(steps) == 1)) + 1
     velocities_mps = (states[follows] - states[follows - 1]) / dt_s
     return TrackPoints(steps[follows], tracks[follows], states[follows]), velocities_mps, order[follows]
+
+
+def near_zero(positions_m: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "points 2"], bool]:
+    """Moves positions by multiples of `FAR_M` in x and y, so that their mean lies near zero, and says if it did.
+
+    Stores and networks compute in float32, which at 5,000 km (coordinates of a map) has steps of half a metre.
+    """
+    offset_m = FAR_M * np.round(positions_m.mean(axis=0) / FAR_M)
+    return positions_m - offset_m, bool(offset_m.any())
 
 
 def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Counter[str]) -> list[Episode]:

@@ -38,7 +38,7 @@ from predictor.data.loading import (
 )
 from predictor.data.store import Episode
 from predictor.data.track_doubts import doubts
-from predictor.data.track_points import TrackPoints, cut_episodes, with_velocities
+from predictor.data.track_points import FAR_M, TrackPoints, cut_episodes, near_zero, with_velocities
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
@@ -52,8 +52,6 @@ SPLIT_SEED = 0
 """Seed of the split of files that are in no such folders."""
 MAX_AGENTS = 128
 """Least `max_agents` of a store; larger where more agents are present at once."""
-FAR_M = 10_000.0
-"""Files whose mean position is farther than half of this from zero are moved by a multiple of it [m]."""
 COARSEST_M = 0.01
 """Largest distance between neighbouring numbers of float32 at which positions are kept [m]."""
 RIGHTS = "Those of the source, which the files do not name: a store made from it falls under the same terms."
@@ -163,8 +161,8 @@ def read_recording(path: Path, config: TracksConfig, counts: Counter[str]) -> Re
 
 
 def _words(text: str) -> list[str]:
-    """Returns the columns of a line without quotes; an empty one between two commas or semicolons stays one."""
-    separator = next((sign for sign in (";", ",") if sign in text), None)
+    """Returns the columns of a line without quotes; an empty one between two commas, semicolons or tabs stays one."""
+    separator = next((sign for sign in (";", ",") if sign in text), "\t" if "\t\t" in text.strip() else None)
     return [word.strip().strip('"') for word in text.split(separator)]
 
 
@@ -247,15 +245,6 @@ def points_of(recording: Recording, frame_step: int, config: TracksConfig, count
     return TrackPoints(moving.steps, moving.tracks, np.concatenate([moving.states, velocities_mps, extra], axis=-1))
 
 
-def near_zero(positions_m: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "points 2"], bool]:
-    """Moves positions by multiples of `FAR_M` in x and y, so that their mean lies near zero, and says if it did.
-
-    Stores and networks compute in float32, which at 5,000 km (coordinates of a map) has steps of half a metre.
-    """
-    offset_m = FAR_M * np.round(positions_m.mean(axis=0) / FAR_M)
-    return positions_m - offset_m, bool(offset_m.any())
-
-
 def scene_spec(config: TracksConfig, agents: int = 0) -> SceneSpec:
     """Returns the layout of the states."""
     extra = tuple(f"column_{column}" for column in config.extra_columns)
@@ -281,6 +270,8 @@ class Part:
     """All files of its source."""
     chosen: tuple[Path, ...]
     """Files of its split."""
+    others: tuple[Path, ...] = ()
+    """Files of the source's other splits, whose frames must be as far apart; they go into other stores."""
 
 
 def parts_of(config: TracksConfig) -> list[Part]:
@@ -294,7 +285,7 @@ def parts_of(config: TracksConfig) -> list[Part]:
         config.check_paths()
         files = tuple(find_files(config.source, config.pattern, "files of tracks"))
         chosen = [path for path in files if in_split(label_of(path, config.source), config.split, SPLIT_SEED)]
-        return [Part(config, files, tuple(chosen))]
+        return [Part(config, files, tuple(chosen), tuple(path for path in files if path not in chosen))]
     if config.split not in ("all", *folders):
         raise UserError(f"{config.source} has the folders {', '.join(folders)}, no {config.split}; leave out --split")
     check_out(config.out, only_stores=True)
@@ -304,7 +295,8 @@ def parts_of(config: TracksConfig) -> list[Part]:
             part = replace(config, source=config.source / name, out=config.out / name, split=name)
             part.check_paths()
             files = tuple(find_files(part.source, part.pattern, "files of tracks"))
-            parts.append(Part(part, files, files))
+            beside = [p for n in folders if n not in ("all", name) for p in (config.source / n).glob(config.pattern)]
+            parts.append(Part(part, files, files, () if config.split == "all" else tuple(sorted(beside))))
     return parts
 
 
@@ -331,7 +323,10 @@ def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
     ]
     files = [(i, path) for i, part in enumerate(parts) for path in part.chosen]
     recordings = {path: read_recording(path, parts[i].config, counts[i]) for i, path in track(files, "tracks")}
-    frame_step = parts[0].config.frame_step or common_frame_step(recordings)
+    frame_step = parts[0].config.frame_step
+    if not frame_step:
+        others = {path: read_recording(path, part.config, Counter()) for part in parts for path in part.others}
+        frame_step = common_frame_step(recordings | others)
     loaded = []
     for part, found in zip(parts, counts, strict=True):
         episodes: list[Episode] = []

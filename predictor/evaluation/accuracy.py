@@ -267,8 +267,9 @@ class Tally:
             "fde_m": metrics.min_fde(forecast[:, :1], future, counted),
             "energy_m": energy_score(forecast, future, counted, outcome.mode_probs),
         }
-        values["overlap"] = metrics.overlap(forecast, valid, self._threshold_m, outcome.mode_probs)
-        values["true_overlap"] = metrics.overlap(future[:, None], valid, self._threshold_m)
+        solid = valid if outcome.carried is None else valid & ~outcome.carried[..., None]
+        values["overlap"] = metrics.overlap(forecast, solid, self._threshold_m, outcome.mode_probs)
+        values["true_overlap"] = metrics.overlap(future[:, None], solid, self._threshold_m)
         if outcome.scale is not None:
             probs = outcome.mode_probs
             if probs is None:

@@ -19,6 +19,8 @@ from predictor.data.windows import WindowBatch, Windows
 from predictor.forecaster import Belief, Forecaster
 from predictor.noise import Noise
 
+CARRIED = "is_ball"
+"""Feature of an agent that others carry."""
 MOST_PAIRS = 1_000_000
 """Largest number of pairs of agents, over windows and samples, in one forward."""
 
@@ -47,6 +49,8 @@ class Outcome:
     """Probability of each sample; None if the samples are draws."""
     scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
     """Standard deviation around each sample [m]; None if the forecaster has no such estimate."""
+    carried: Bool[Tensor, "batch agents"] | None = None
+    """Which agents others carry (`CARRIED`): who holds them does not overlap with them. None where nothing can be."""
     episode: Int[np.ndarray, " batch"] | None = None
     """Number of each window's episode; None where it is not known."""
 
@@ -226,16 +230,18 @@ def _free_run(
     steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=window.device)
     truth = batch.states[window[:, None], steps].transpose(1, 2)[..., :axes]
     valid = batch.valid[window[:, None], steps].transpose(1, 2) & belief.valid[..., None]
+    now, names = (window, batch.last_observed), forecaster.spec.feature_names
     outcome = Outcome(
         futures.states[..., :axes],
         truth,
         _without_ego(forecaster, valid),
         mode_probs=futures.mode_probs,
         scale=futures.scale,
+        carried=batch.states[now][..., names.index(CARRIED)] > 0.5 if CARRIED in names else None,
     )
     if not keep_beliefs:
         return outcome
-    now, belief = (window, batch.last_observed), belief.dense()
+    belief = belief.dense()
     return replace(
         outcome,
         edge_probs=belief.edge_probs,

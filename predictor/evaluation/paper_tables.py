@@ -125,6 +125,8 @@ class Table:
     """Smallest spring constant of the data [N/m], for least squares; pairs below half of it have no spring."""
     overlap_m: float = 0.0
     """Distance of two centres below which agents overlap [m]; 0 leaves the column out: points pass through another."""
+    overlap_of: str = "agents"
+    """Who overlaps, for the caption."""
     published: dict[str, float] = field(default_factory=dict)
     """Graph accuracies that another paper reports for this data, by its names."""
 
@@ -285,6 +287,7 @@ MOCAP = Table(
 NBA = Table(
     title="NBA",
     overlap_m=0.5,
+    overlap_of="players",
     train="nba_train",
     tests={"test": "nba_test"},
     commands=(

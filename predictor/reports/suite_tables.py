@@ -136,7 +136,8 @@ def _horizon(content: dict[str, Any], kind: str) -> Grid:
     columns = ["model", "K", *HORIZON.values(), "NLL", "90 % cover", "… of mixture"]
     if overlap_m:
         columns.append("overlap (truth)")
-        caption += f"Overlap: agents nearer than {overlap_m:g} m to another one of the same sample. "
+        of = content.get("overlap_of", "agents")
+        caption += f"Overlap: {of} nearer than {overlap_m:g} m to another one of the same sample. "
     lines = []
     for row in content["rows"]:
         accuracy = row["tests"][kind]["horizon_only"]
@@ -228,7 +229,8 @@ def _percent(share: float, digits: int = 0) -> str:
 
 
 def _escaped(cell: str) -> str:
-    for plain_text, latex in (("%", r"\%"), ("±", r"$\pm$"), ("₁", "$_1$"), ("²", "$^2$"), ("…", r"\ldots{}")):
+    signs = {"%": r"\%", "±": r"$\pm$", "₁": "$_1$", "²": "$^2$", "σ": r"$\sigma$", "…": r"\ldots{}"}
+    for plain_text, latex in signs.items():
         cell = cell.replace(plain_text, latex)
     return cell
 

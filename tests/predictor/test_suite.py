@@ -227,14 +227,22 @@ def test_lines_keep_their_folders_when_training_gets_options_or_other_defaults(
 ):
     """Names of before `--causal-edges` existed; a new option goes into `ADDED` with the value that changes nothing."""
     monkeypatch.setattr(suite, "content_id", lambda path: path.name)
-    settings = SuiteConfig("nba", tmp_path, tmp_path)
+    settings = SuiteConfig("sdd", tmp_path, tmp_path)
     expected = {
-        "nearest-neighbours": "ebf5a8f5df", "dnri": "8979c3fe0d", "dgvae-paper": "59b2f8d38c", "plural": "69071be171",
+        "nearest-neighbours": "c7c43f95ad", "dnri": "b5b3fb1167", "dgvae-paper": "2edad84780", "plural": "c064e2d1ed",
     }  # fmt: skip
-    for each in TABLES["nba"].lines:
+    for each in TABLES["sdd"].lines:
         if each.key in expected:
             assert line_folder(settings, each).name == f"{each.key}-{expected.pop(each.key)}"
     assert not expected
+
+
+def test_results_in_which_the_ball_was_a_player_are_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(suite, "content_id", lambda path: path.name)
+    settings, (first, *_) = SuiteConfig("nba", tmp_path, tmp_path), TABLES["nba"].lines
+    of_players = line_folder(settings, first)
+    monkeypatch.setitem(TABLES, "nba", replace(TABLES["nba"], overlap_of="agents"))
+    assert line_folder(settings, first) != of_players
 
 
 @pytest.mark.parametrize("option", ["causal_edges", "reaction_weight"])

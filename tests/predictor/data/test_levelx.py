@@ -222,6 +222,11 @@ def test_broken_tracks_are_one_line(case: str, blank: int, dataset: Path, tracks
     loader.refuses(dataset, f"{tracks}, line {3 + blank}: {message}")
 
 
+def test_a_line_of_blanks_is_named(dataset: Path, tracks: Path, loader: Loader):
+    change_line(tracks, 3, "   ")
+    loader.refuses(dataset, f"{tracks}, line 3: it holds only blanks; delete it")
+
+
 def test_bytes_that_are_no_text(dataset: Path, tracks: Path, loader: Loader):
     tracks.write_bytes(tracks.read_bytes().replace(b"0,1,7,?", b"0,1,7,\xff"))
     loader.refuses(dataset, f"{tracks}, line 9: expected text in UTF-8")

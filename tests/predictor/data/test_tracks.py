@@ -245,6 +245,24 @@ def test_files_outside_of_folders_are_divided_by_name(source: Path, loader: Load
     assert sorted(found) == sorted(["walk", *(f"video{i}" for i in range(30))])
 
 
+@pytest.mark.parametrize("in_folders", [False, True])
+def test_a_split_alone_has_the_frames_of_all(in_folders: bool, tmp_path: Path, loader: Loader):
+    """Else the steps of train and test would be of other lengths, under one dt_s."""
+    source = tmp_path / "rates"
+    names = {split: next(f"r{i}" for i in range(99) if split_of(f"r{i}", tracks.SPLIT_SEED) == split)
+             for split in ("train", "test")}  # fmt: skip
+    for split, name in names.items():
+        folder = source / split if in_folders else source
+        folder.mkdir(parents=True, exist_ok=True)
+        apart = 10 if split == "train" else 5
+        (folder / f"{name}.txt").write_text(text_of([(apart * t, 1, t, 0) for t in range(8)]))
+    for split in ("all", "train", "test"):
+        code, errors = loader.run(source, "--split", split)
+        assert code == 2 and "apart, those of" in errors[0] and "pass --frame-step" in errors[0], split
+        assert not loader.store.exists()
+    assert loader.run(source, "--split", "test", "--frame-step", "5") == (0, [])
+
+
 def test_files_of_one_name_in_folders_are_recordings_of_their_own(source: Path, loader: Loader):
     for i in range(30):
         (source / f"video{i}").mkdir()
@@ -277,6 +295,7 @@ ROW_ERRORS = {
         "expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 3; repair",
     ),
     "empty column": ("790,4,,50", "x must be a finite number, got ''"),
+    "empty column between tabs": ("790\t4\t\t50\t1", "x must be a finite number, got ''"),
     "names in the middle": ("frame id x y", "frame must be a finite number, got 'frame'"),
     "nan": ("790 4 nan 50", "x must be a finite number, got 'nan'"),
     "text": ("790 4 102 five", "y must be a finite number, got 'five'"),

@@ -5,10 +5,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
+from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.graph_accuracy import graph_accuracy
 from predictor.evaluation.outcomes import (
+    CARRIED,
     Outcome,
     run_sequence_batch,
     run_window_batch,
@@ -17,7 +20,7 @@ from predictor.evaluation.outcomes import (
 )
 from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
-from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import ROAD, any_model, model, random_presence, random_states, spec
 
 SOLID = SceneSpec(
@@ -254,3 +257,30 @@ def test_windows_of_nobody_fit_into_one_forward():
     windows = Windows([nobody], spec(has_ego=False), 2, 2)
     chosen = np.flatnonzero(windows.index[:, 1] < 5)
     assert windows_per_forward(windows, chosen, 3) == 256
+
+
+def test_a_ball_does_not_overlap_with_who_holds_it():
+    """Ten players five metres apart, the ball in the hand of one: nobody is nearer than half a metre to another one."""
+    court = SceneSpec(
+        0.12,
+        ("centroid", "centroid"),
+        feature_names=(*KINEMATIC_FEATURES, CARRIED),
+        feature_scales=(1.0,) * 5,
+        has_ego=False,
+        max_agents=11,
+    )
+    states = torch.zeros(1, 6, 11, 5)
+    states[..., 1:, 0] = 5.0 * torch.arange(10)
+    states[..., 0, :2], states[..., 0, 4] = torch.tensor([0.2, 0.2]), 1.0
+    batch = WindowBatch(states, torch.ones(1, 6, 11, dtype=torch.bool), torch.tensor([2]))
+
+    def overlaps(batch: WindowBatch) -> tuple[float, float]:
+        found = summarise("still", [run_window_batch(ConstantVelocity(court), batch, 3)], miss_threshold_m=0.5)
+        return found.overlap, found.true_overlap
+
+    assert overlaps(batch) == (0.0, 0.0)
+    states[..., 2, 0] = 0.3  # two players
+    assert overlaps(batch) == pytest.approx((0.2, 0.2))
+    plain = spec(has_ego=False)
+    others = WindowBatch(states[..., : plain.num_features], batch.valid, batch.last_observed)
+    assert run_window_batch(ConstantVelocity(plain), others, 3).carried is None

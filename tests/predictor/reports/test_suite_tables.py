@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
+from predictor.evaluation.paper_tables import TABLES
 from predictor.evaluation.training_seeds import joined
-from predictor.reports.suite_tables import grids, latex_table, markdown_report
+from predictor.reports.suite_tables import _escaped, grids, latex_table, markdown_report
 from predictor.support.errors import UserError
 
 LENGTHS = ("ade_m", "fde_m", "min_ade_m", "min_fde_m", "min_joint_ade_m", "energy_m", "overall_rmse_m")
@@ -87,7 +88,14 @@ def test_overlap_stands_where_agents_have_a_size():
     rows = [joined([result("model")])]
     assert "overlap (truth)" not in grids(content(rows))[0].columns
     grid = grids(content(rows, overlap_m=0.5))[0]
-    assert cells(grid, "Model")["overlap (truth)"] == "6.2 (3.1) %" and "nearer than 0.5 m" in grid.caption
+    assert cells(grid, "Model")["overlap (truth)"] == "6.2 (3.1) %" and "agents nearer than 0.5 m" in grid.caption
+    assert "players nearer than 0.5 m" in grids(content(rows, overlap_m=0.5, overlap_of="players"))[0].caption
+
+
+def test_every_name_of_a_line_can_be_set_by_latex():
+    """In its own letters or by a macro."""
+    names = {line.name for table in TABLES.values() for line in table.lines}
+    assert {name for name in names if not _escaped(name).replace("–", "-").isascii()} == set()
 
 
 def test_seeds_are_shown_by_mean_and_range_and_a_line_without_training_keeps_its_standard_error():
