@@ -233,7 +233,7 @@ class MultiagentArena:
         lived = set(left)
         while left and not (lived.issuperset(returns) and returns.keys().isdisjoint(left)):
             check_ends(steps, self._task.env_id)
-            own = own_observations(observations)
+            own = own_observations({agent: observations[agent] for agent in left if agent in observations})
             seen = own if is_own(name) else {agent: one for agent, one in own.items() if agent in returns}
             chosen = {agent: action for agent, action in driver(seen).items() if agent in returns}
             acting = returns.keys() & left

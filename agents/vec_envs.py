@@ -317,7 +317,7 @@ class SeededEpisodes(gym.Wrapper):
             self._recorder.note()
         if self._seed is not None:
             if terminated or truncated:
-                info[EPISODE_INFO] = self._result(self._seed, info)
+                info = {**info, EPISODE_INFO: self._result(self._seed, info)}  # some environments reuse theirs
             else:
                 check_ends(len(self._rewards), f"env '{scene_source(self.env)}'")
         return obs, reward, terminated, truncated, info

@@ -8,6 +8,7 @@ import math
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -122,11 +123,13 @@ class SupervisedEnv(gym.Wrapper):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Makes a step."""
+        """Makes a step; an episode's last observation is a copy, as the next reset may write into the array."""
         self._place.move()
         with named(self._id, self._place):
             observation, reward, terminated, truncated, info = self.env.step(action)
             check_numbers(observation, reward)
+            if terminated or truncated:
+                observation = deepcopy(observation)
         return observation, reward, terminated, truncated, info
 
 

@@ -80,6 +80,7 @@ class DrivingRecorder:
     def measures(self) -> DrivingMeasures:
         """Returns the measures of the episode so far, which has at least one step."""
         accelerations = np.diff(self._speeds_mps) / self._dt_s
+        braking = -np.diff(np.abs(self._speeds_mps)) / self._dt_s  # also of a car that drives backwards
         jerks = np.diff(accelerations) / self._dt_s
         return DrivingMeasures(
             len(self._off_road) * self._dt_s,
@@ -87,7 +88,7 @@ class DrivingRecorder:
             self._lane_changes,
             min(self._contacts_s),
             float(np.quantile(self._contacts_s, LOW_QUANTILE)),
-            float(np.mean(accelerations < -HARD_BRAKING_MPS2)) if len(accelerations) else None,
+            float(np.mean(braking > HARD_BRAKING_MPS2)) if len(accelerations) else None,
             float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None,
         )
 

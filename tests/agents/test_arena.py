@@ -81,6 +81,62 @@ def test_drivers_get_no_reward_of_agents_that_have_ended():
     arena.close()
 
 
+class RefusesTheDead(GoesOnPaying):
+    """Keeps the agents that live alone, and takes no action of another one."""
+
+    def step(self, actions: Any) -> Any:
+        dead = set(actions) - set(self.agents)
+        if dead:
+            raise KeyError(f"action for dead {sorted(dead)}")
+        found = super().step(actions)
+        self.agents = [agent for agent in self.agents if not found[2][agent]]
+        return found
+
+
+def test_a_driver_of_ones_own_sees_agents_that_live_alone(monkeypatch: pytest.MonkeyPatch):
+    """The last observation of one that has ended is still there in the step after."""
+    monkeypatch.setattr("agents.arena.make_driver", lambda *_: lambda seen: dict.fromkeys(seen, 0))
+    arena = open_arena(Task(f"{__name__}:RefusesTheDead", "none"), 1)
+    (result,) = arena.play("own:module:name", [5])
+    assert (result.episode_return, result.length) == ((2 + 10) / 2, 10)
+    arena.close()
+
+
+class ReusesItsInfo(gym.Env[np.ndarray, np.int64]):
+    """Pays its action in each of three steps, and returns the same info each time."""
+
+    observation_space = gym.spaces.Box(0, 9, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self.info: dict[str, Any] = {}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), self.info
+
+    def step(self, action: Any) -> Any:
+        self.time += 1
+        return np.full(1, self.time, np.float32), float(action), False, self.time == 3, self.info
+
+
+gym.register("ReusesItsInfo-v0", entry_point=ReusesItsInfo)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_an_environment_that_reuses_its_info_gives_each_policy_its_own_results(num_envs: int):
+    """The result of the policy before stood in the environment's own dict, and was taken for that of the next."""
+    task = Task(f"{__name__}:ReusesItsInfo-v0", "none")
+    arena, seeds = open_arena(task, num_envs, in_process=True), range(4)
+    for action, expected in ((1, 3.0), (0, 0.0), (1, 3.0)):
+        calls: list[None] = []
+        results = arena.play(f"action-{action}", seeds, lambda calls=calls: calls.append(None))
+        assert [(r.seed, r.episode_return, r.length) for r in results] == [(seed, expected, 3) for seed in seeds]
+        assert len(calls) == 4
+    arena.close()
+
+
 @pytest.mark.parametrize("obeys", [True, False])
 def test_a_driver_of_ones_own_sees_all_agents_and_moves_the_learners(obeys: bool, monkeypatch: pytest.MonkeyPatch):
     """Also where it gives an action for each agent that lives, as it is asked to."""

@@ -10,9 +10,12 @@ from agents import vec_envs
 from agents.arena import MultiagentArena, run_episodes
 from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, SeededEpisodes, make_venv
+from envs import readers
+from envs.readers.function import FunctionReader
 from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
 from envs.sb3 import envpool as envpool_module
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -258,4 +261,44 @@ def test_envpool_environments_observe_what_gymnasium_environments_do():
 def test_learners_of_a_multiagent_env_are_environments():
     venv = make_venv(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
     assert venv.num_envs == 6
+    venv.close()
+
+
+class CountingAlone(gym.Env[np.ndarray, np.int64]):
+    """One ego that sees the number of the step, in an array that every step and reset writes into."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self._array = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self._array[:] = 0
+        return self._array, {}
+
+    def step(self, action: Any) -> Any:
+        self._array += 1
+        return self._array, 1.0, False, bool(self._array[0] == 3), {}
+
+
+gym.register("CountingAlone-v0", entry_point=CountingAlone)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_a_reset_does_not_change_the_last_observation(observe: Any, copies: int, monkeypatch: pytest.MonkeyPatch):
+    """From it the value of a truncated episode is bootstrapped."""
+    scene = Scene(np.zeros((1, 4)), np.zeros(1, int), np.ones(1, bool))
+    reader = FunctionReader(lambda env: scene, SceneSpec(dt_s=1.0, max_agents=2))
+    monkeypatch.setitem(readers._REGISTERED, CountingAlone, reader)
+    venv = make_venv(Task(f"{__name__}:CountingAlone-v0", observe), copies, in_process=True)
+    venv.reset()
+    for _ in range(3):
+        _, _, dones, infos = venv.step(np.zeros(copies, int))
+    assert dones.all()
+    for info in infos:
+        closing = info["terminal_observation"]
+        assert (closing["observation"] if isinstance(closing, dict) else closing).tolist() == [3.0]
     venv.close()

@@ -54,6 +54,14 @@ def in_lane(lane: int, y_m: float | None = None) -> Callable[[Any], None]:
     return lambda base: place(base, 100.0, lane, 20.0, y_m)
 
 
+def test_a_car_that_drives_backwards_brakes_where_it_slows_down(env: gym.Env):
+    backwards = [at_speed(-4.0 * step) for step in range(1, 3)]
+    stop = at_speed(0.0)  # from 20 m/s: the one hard step of three
+    assert drive(env, stop, *backwards).hard_brake_share == pytest.approx(1 / 3)
+    env.unwrapped.vehicle.speed = 20.0  # type: ignore[attr-defined]
+    assert drive(env, stop, *backwards, at_speed(-4.0), stop).hard_brake_share == pytest.approx(3 / 5)
+
+
 def test_steady_driving_alone(env: gym.Env):
     measures = drive(env, *[at_speed(20.0)] * 4)
     assert measures == DrivingMeasures(4.0, 0.0, 0, LONGEST_S, LONGEST_S, 0.0, 0.0)
