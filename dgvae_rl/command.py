@@ -4,6 +4,7 @@ Like `python -m`, it finds modules of the folder that it is called in, so that `
 Unlike there, a folder `envs/` of the user hides nothing of ours (`dgvae_rl.own_packages`).
 """
 
+import contextlib
 import difflib
 import importlib
 import os
@@ -95,8 +96,9 @@ def run(words: Sequence[str]) -> None:
 
 def main() -> None:
     """Runs the command line of this process."""
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    with contextlib.suppress(FileNotFoundError):  # a folder that was deleted
+        if not sys.flags.safe_path and os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())
     try:
         # Ctrl-C is one line also while the command is imported
         importlib.import_module("dgvae_rl.predictor.support.errors").run_entry_point(lambda: run(sys.argv[1:]))

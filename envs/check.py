@@ -55,8 +55,8 @@ def examined(config: CheckConfig) -> Examined:
     Raises:
         UserError: no such environment, or no reader knows it.
     """
-    env = make_any_env(config.env_id, **arguments_of(config.env_kwargs))
     make_reader: MakeReader | None = None if config.reader is None else load_named(config.reader)
+    env = make_any_env(config.env_id, **arguments_of(config.env_kwargs))
     try:
         return examine_reader(env, make_reader, episodes=config.episodes, max_steps=config.max_steps, seed=config.seed)
     finally:

@@ -343,9 +343,10 @@ def main() -> None:
     """Entry point."""
     config = parse(CollectConfig, __doc__)
     check_new_store(config.out, config.overwrite)
-    with open_pool(config) as pool:
+    with resumable("what an earlier start kept is still there; the same command goes on"), open_pool(config) as pool:
         info = _info_from(config, pool)
         with locked_path(config.out), locked_path(beside(config.out)):
+            check_new_store(config.out, config.overwrite)  # another recording may have ended meanwhile
             partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
             done = partial.num_done
             with resumable(lambda: _kept(config, partial)), partial:

@@ -15,7 +15,7 @@ from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpool_ids
 from envs.simulators.highway_settings import check_settings
 from predictor.support.errors import UserError, named, short
-from predictor.support.importing import load_named
+from predictor.support.importing import CannotImportError, load_named
 from predictor.support.reading import parse_json
 from predictor.support.typed_values import converted
 
@@ -279,11 +279,17 @@ def make_any_env(env_id: str, **kwargs: Any) -> Any:
 
 
 def _function_named(env_id: str) -> Callable[..., Any] | None:
-    """Returns the function that "module:function" names; None if it is an id, "module:Id" included."""
+    """Returns the function that "module:function" names; None if it is an id, "module:Id" included.
+
+    Raises:
+        UserError: the module cannot be imported.
+    """
     if ":" not in env_id:
         return None
     try:
         return load_named(env_id)
+    except CannotImportError:
+        raise
     except UserError:
         return None
 
@@ -301,6 +307,10 @@ def is_multiagent_id(env_id: str) -> bool:
 
     try:
         factory = load_named(env_id)
+    except CannotImportError as error:
+        if isinstance(error.__cause__, SystemExit):  # importing it again would end this process
+            raise
+        return False
     except UserError:
         return False
     return not isinstance(factory, type) or issubclass(factory, ParallelEnv)

@@ -40,6 +40,8 @@ BEST_OF_RUN = "checkpoint"
 MOST_CONFIG_BYTES, MOST_WEIGHT_BYTES, MOST_CARD_BYTES = 4 * MIB, 4096 * MIB, MIB
 """Largest sizes of the two files, and of the card beside them."""
 MOST_BYTES = {CONFIG: MOST_CONFIG_BYTES, WEIGHTS: MOST_WEIGHT_BYTES}
+_BESIDE = (CONFIG, WEIGHTS, CARD, "in_env.json", ".gitattributes")
+"""Files that a checkpoint's folder may hold where it is replaced as a whole."""
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
 
@@ -79,10 +81,12 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     """Writes a checkpoint folder; an existing one is replaced only when the new one is complete and can be read.
 
     Raises:
-        UserError: the network is of another kind than `info` says, or a checkpoint may not hold its weights or `info`.
+        UserError: the network is of another kind than `info` says, a checkpoint may not hold its weights or `info`, or
+            the folder holds something else than a checkpoint.
     """
     if name_of(model) != info.model:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
+    _check_replaceable(Path(path))
     with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
         write_bytes(partial / WEIGHTS, save(tensors))  # `save_file` would not follow the umask, nor flush
@@ -90,6 +94,19 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
         with told_of(path, partial):
             read_info(partial)
             read_weights(partial / WEIGHTS, {key: tuple(tensor.shape) for key, tensor in tensors.items()})
+
+
+def _check_replaceable(path: Path) -> None:
+    """Raises a `UserError` where writing a checkpoint would delete something else: a run folder, say."""
+    if is_remote(path) or not path.is_dir():
+        return  # on other file systems, files that are not of a checkpoint stay
+    found = sorted(entry.name for entry in path.iterdir())
+    others = [name for name in found if name not in _BESIDE]
+    if others or (found and not {WEIGHTS, CONFIG} <= set(found)):
+        raise UserError(
+            f"{short(path)} holds {short((others or found)[0], 60)} and is no checkpoint, which alone is replaced; "
+            "choose another folder"
+        )
 
 
 def resolve(name: str | Path) -> Path:

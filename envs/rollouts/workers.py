@@ -23,6 +23,8 @@ from predictor.support.processes import end, follow_parent, how_it_ended, start
 
 OnError = Literal["stop", "skip"]
 """What an episode that fails does: it stops the command, or is left out."""
+MOST_AHEAD = 32
+"""Number of episodes for each worker that may be played beyond one that is not finished: they wait in memory."""
 _POLL_S = 1.0
 _MOMENT_S = 2.0
 """Longest time between two looks at a worker that counts; more, and this process itself was paused."""
@@ -135,7 +137,7 @@ class EpisodePool(Generic[Result]):
         for wanted in range(len(tasks)):
             while wanted not in found:
                 if not failed:
-                    self._hand_out(waiting, tasks)
+                    self._hand_out(waiting, tasks, wanted + MOST_AHEAD * self._size)
                 for number, result in self._received(tasks):
                     found[number] = result
                     failed = failed or self._stops(result)
@@ -160,12 +162,12 @@ class EpisodePool(Generic[Result]):
         skips = self._on_error == "skip"
         return isinstance(result, Failed) and not (skips and result.kind is EnvironmentFailedError)
 
-    def _hand_out(self, waiting: deque[int], tasks: Sequence[SeededTask]) -> None:
-        """Gives each free worker a task; starts workers that are missing."""
+    def _hand_out(self, waiting: deque[int], tasks: Sequence[SeededTask], end: int) -> None:
+        """Gives each free worker a task whose number is below `end`; starts workers that are missing."""
         while len(self._workers) < min(self._size, len(waiting) + self._num_busy()):
             self._workers.append(_started(self._play))
         for worker in self._workers:
-            if worker.number is None and waiting:
+            if worker.number is None and waiting and waiting[0] < end:
                 worker.number = waiting.popleft()
                 worker.place.clear()
                 worker.wait_anew()

@@ -1,6 +1,7 @@
 """Plays episodes with random actions and keeps what the reader reports of them."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -73,6 +74,33 @@ class OpenReader:
         spec: SceneSpec = self.reader.spec
         return spec
 
+    def begin(self, observation: Any) -> None:
+        """Resets the reader and shows it the first observation.
+
+        Raises:
+            ReaderProblem: it raised.
+        """
+        with self._named("reset"):
+            self.reader.reset()
+        self.see(observation)
+
+    def see(self, observation: Any) -> None:
+        """Shows the reader an observation.
+
+        Raises:
+            ReaderProblem: it raised.
+        """
+        with self._named("see"):
+            show(self.reader, observation)
+
+    @contextmanager
+    def _named(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            kind = "" if isinstance(error, UserError) else f"{self.name}: {what} failed with {type(error).__name__}: "
+            raise ReaderProblem(_line(f"{kind}{error}")) from error
+
     def read(self, env: Any) -> Moment:
         """Reads all agents, twice, and checks what arrives.
 
@@ -85,7 +113,7 @@ class OpenReader:
         return first
 
     def _all(self, env: Any) -> Moment:
-        try:
+        with self._named("reading"):
             index_of: Mapping[str, int] = {}
             if self.spec.has_ego:
                 self._check_view(self.reader.read(env))
@@ -94,9 +122,6 @@ class OpenReader:
             else:
                 several = check_multiagent_scene(self.reader.read(env), self.spec, self.name)
                 scene, index_of = several.scene, several.index_of
-        except Exception as error:
-            kind = "" if isinstance(error, UserError) else f"{self.name}: reading failed with {type(error).__name__}: "
-            raise ReaderProblem(_line(f"{kind}{error}")) from error
         there = scene.valid
         named = {name: int(scene.ids[index]) for name, index in index_of.items()}
         return Moment(scene.states[there].copy(), scene.ids[there].copy(), float(scene.heading_rad), named)
@@ -170,12 +195,11 @@ def begin(env: Any, opened: OpenReader | None, seed: int) -> Any:
     """Resets the environment, and the reader if there is one; returns the observation.
 
     Raises:
-        ReaderProblem: the environment raised, or returned something else.
+        ReaderProblem: the environment or the reader raised, or the environment returned something else.
     """
     observation = asked_reset(env, seed)
     if opened is not None:
-        opened.reader.reset()
-        show(opened.reader, observation)
+        opened.begin(observation)
     return observation
 
 
@@ -183,11 +207,11 @@ def step(env: Any, opened: OpenReader | None, action: Any) -> tuple[Any, Any, bo
     """Steps the environment; returns observation, reward, and whether the episode is over.
 
     Raises:
-        ReaderProblem: the environment raised, or returned something else.
+        ReaderProblem: the environment or the reader raised, or the environment returned something else.
     """
     observation, reward, terminated, truncated, _ = asked_step(env, action)
     if opened is not None:
-        show(opened.reader, observation)
+        opened.see(observation)
     return observation, reward, not env.agents if isinstance(env, ParallelEnv) else bool(terminated or truncated)
 
 

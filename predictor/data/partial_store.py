@@ -20,6 +20,7 @@ from predictor.support.errors import UserError
 from predictor.support.files import delete_folder, delete_leftovers, write_json
 from predictor.support.reading import read_object
 from predictor.support.remote import address, is_remote
+from predictor.support.stopping import deferred_stops
 
 PART_S = 30.0
 """Time after which the episodes that have been recorded since the last part are written [s]."""
@@ -154,9 +155,15 @@ class PartialStore:
         delete_folder(self.folder)
 
     def _write_part(self) -> None:
+        """Writes what is not on disk yet; a signal waits until the part is there and counted."""
         self._written_at = time.monotonic()
         if not self._added or (not self._new and not self.skipped):
             return
+        with deferred_stops() as stops:
+            self._write()
+        stops.stop()
+
+    def _write(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / SETTINGS, self._settings)
         part = self.folder / f"{self.num_done:08d}+{self._added}"

@@ -317,10 +317,11 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     last["label_starts"] = next((len(arrays[name]) for name in _FILL if name in arrays), 0)
     for name in ("starts", "label_starts"):
         places = arrays.get(name)
-        if places is not None and (places[0] != 0 or places[-1] != last[name] or (np.diff(places) < 1).any()):
+        # not by differences, which wrap around
+        if places is not None and (places[0] != 0 or places[-1] != last[name] or (places[1:] <= places[:-1]).any()):
             raise UserError(f"{path}: '{name}' must rise from 0 to {last[name]}; copy or collect it anew")
     if "label_starts" in arrays:
-        labelled, steps = np.diff(arrays["label_starts"]), np.diff(arrays["starts"])
+        labelled, steps = (np.diff(arrays[name].astype(np.int64)) for name in ("label_starts", "starts"))
         if ((labelled != 1) & (labelled != steps)).any():
             raise UserError(f"{path}: an episode's edges need one step or every step; collect it anew")
     for name in _FILL.keys() & arrays.keys():

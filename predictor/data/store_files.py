@@ -157,10 +157,10 @@ def check_new_store(path: Path, overwrite: bool) -> None:
 
 
 def check_replaceable(path: Path) -> None:
-    """Checks that a path that may be replaced holds a store: another Zarr group is never overwritten.
+    """Checks that a path that may be replaced holds a store, and nothing else: all below it is deleted.
 
     Raises:
-        UserError: it holds something else.
+        UserError: it holds something else, such as another Zarr group, or other stores beside its own arrays.
     """
     if is_unfinished(path):
         return
@@ -170,6 +170,14 @@ def check_replaceable(path: Path) -> None:
         raise UserError(
             f"{address(path)} is not an episode store and will not be replaced; choose another path"
         ) from error
+    if is_remote(path):
+        return  # arrays alone are replaced there
+    others = sorted(entry.name for entry in path.iterdir() if entry.name not in (METADATA, *_ARRAYS))
+    if others:
+        raise UserError(
+            f"{address(path)} also holds {short(others[0], 60)}, which is no part of the store and would be lost; "
+            "move it, or choose another path"
+        )
 
 
 def read_header(path: Path, format: str) -> StoreHeader:

@@ -5,6 +5,7 @@ with the new one at once; elsewhere it is absent for a moment, and after a crash
 ``.NAME.old``. A disk that is full or read-only ends in one sentence (`CannotWriteError`), with the old version whole.
 """
 
+import contextlib
 import ctypes
 import glob
 import json
@@ -182,6 +183,9 @@ def check_place(out: Path) -> None:
     if is_remote(out):
         return
     try:
+        if out.name:
+            with contextlib.suppress(FileNotFoundError):
+                os.stat(_beside(out, out.suffix))  # whose name is longer
         os.stat(out)
     except FileNotFoundError as error:
         if out.is_symlink():

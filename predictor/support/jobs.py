@@ -8,6 +8,7 @@ of its task, so that a command that follows a killed one waits for the last of i
 import contextlib
 import fcntl
 import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -18,12 +19,13 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from predictor.support.cluster import Cluster, Lost, Packed, check_shared
 from predictor.support.errors import run_entry_point
-from predictor.support.locks import LOCK_FILE
+from predictor.support.locks import LOCK_FILE, open_own
 from predictor.support.processes import end, follow_parent, how_it_ended, print_into, start
 from predictor.support.stopping import resumable
 
 SAVING_S = 60.0
 """Time that a task's process gets to save its training when the command is stopped [s]."""
+APPENDING = os.O_WRONLY | os.O_APPEND
 LOG_FILE = "log.txt"
 SERVED = "forkserver" if sys.platform == "linux" else "spawn"
 """How processes start that share imports."""
@@ -146,6 +148,8 @@ def _run_alone(remote: _Remote) -> int | None:
 
 def _started(task: Task | Packed, folder: Path, imports: Sequence[str] = ()) -> BaseProcess:
     folder.mkdir(parents=True, exist_ok=True)
+    for name in (LOG_FILE, LOCK_FILE):
+        os.close(open_own(folder / name, APPENDING))  # a link is told by this process, which is asked
     context: Any = multiprocessing.get_context(SERVED if imports else "spawn")
     if imports and SERVED == "forkserver":
         context.set_forkserver_preload(list(imports))
@@ -157,7 +161,8 @@ def _started(task: Task | Packed, folder: Path, imports: Sequence[str] = ()) -> 
 def _work(task: Task | Packed, folder: Path) -> None:
     """Does a task in a process of its own; SIGTERM saves what it trains. The log of an earlier try goes on."""
     follow_parent()
-    with (folder / LOG_FILE).open("a", buffering=1) as log, (folder / LOCK_FILE).open("a") as lock:
+    log, lock = (os.fdopen(open_own(folder / name, APPENDING), "a", 1) for name in (LOG_FILE, LOCK_FILE))
+    with log, lock:
         print_into(log)
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(lock, fcntl.LOCK_EX)  # the process of a command or machine that was killed may still be here

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,7 +94,7 @@ def _held_file(file: Path, problem: str, other: str) -> Iterator[None]:
 def _taken(file: Path, problem: str, other: str) -> int:
     """Returns the descriptor of a file that is locked and still there: another process may have removed it."""
     while True:
-        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = open_own(file, os.O_RDWR)
         try:
             _lock(descriptor, problem, other)
             if _is_there(file, descriptor):
@@ -105,6 +106,26 @@ def _taken(file: Path, problem: str, other: str) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
+
+
+def open_own(file: Path, flags: int) -> int:
+    """Opens a file of a run's own for writing, and makes it if there is none; returns its descriptor.
+
+    Raises:
+        UserError: it is a link, or another name of a file, which a stranger's folder may have: what it leads to would
+            be written over. Or it is no file.
+    """
+    try:
+        descriptor = os.open(file, flags | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.EMLINK, errno.ENXIO, errno.EISDIR):
+            raise
+        raise UserError(f"{file} must be a file of its own, not a link or a pipe; remove it") from error
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        os.close(descriptor)
+        raise UserError(f"{file} must be a file of its own, not a link or a pipe; remove it")
+    return descriptor
 
 
 def _lock(descriptor: int, problem: str, other: str) -> None:

@@ -1,6 +1,7 @@
 """Typed values from JSON and TOML: an object becomes a dataclass, and what does not fit is named by its key."""
 
 import dataclasses
+import math
 import types
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -82,7 +83,8 @@ def converted(value: Any, kind: Any, where: str) -> Any:
         try:
             return float(value)
         except OverflowError as error:
-            raise UserError(f"{where} must be a number of at most 308 digits, got one of {len(str(value))}") from error
+            digits = int(value.bit_length() * math.log10(2)) + 1
+            raise UserError(f"{where} must be a number of at most 308 digits, got one of {digits}") from error
     if type(value) is not kind:
         raise UserError(f"{where} must be {_WORDS.get(kind, str(kind))}, got {_shown(value)}")
     return value
@@ -101,7 +103,10 @@ def _tuple(value: Any, kinds: tuple[Any, ...], where: str) -> tuple[Any, ...]:
 
 
 def _shown(value: Any) -> str:
-    return short(repr(value), _MOST_SHOWN)
+    try:
+        return short(repr(value), _MOST_SHOWN)
+    except ValueError:  # Python writes no integer of thousands of digits
+        return "an integer of thousands of digits"
 
 
 def _one_of(value: Any, kinds: list[Any], where: str) -> Any:

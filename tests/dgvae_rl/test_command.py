@@ -84,3 +84,16 @@ def test_it_finds_modules_of_the_working_folder_and_user_errors_are_one_line(tmp
     )  # fmt: skip
     assert (tmp_path / "imported").read_text() == str(tmp_path / "envs" / "__init__.py")
     assert done.stderr.startswith("error: cannot make env 'mine:Absent-v0'") and done.returncode == 2
+
+
+@pytest.mark.slow
+def test_a_stranger_s_folder_imports_nothing_where_python_is_told_so(tmp_path: Path):
+    (tmp_path / "mine.py").write_text("import pathlib\npathlib.Path('imported').write_text('')\n")
+    done = subprocess.run(
+        [sys.executable, "-c", "from dgvae_rl.command import main; main()", "collect", "--env-id", "mine:Absent-v0"]
+        + ["--out", "data"],
+        cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert not (tmp_path / "imported").exists()
+    assert "No module named 'mine'" in done.stderr and done.returncode == 2

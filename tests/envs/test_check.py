@@ -13,12 +13,15 @@ import pytest
 from envs import check
 from envs.check import CheckConfig, examined, with_option
 from envs.collect import CollectConfig, warnings_of
-from envs.testing import store_problems
+from envs.readers import reader_for
+from envs.registry import is_multiagent_id
+from envs.testing import examine_reader, store_problems
 from envs.testing.playing import Episode as EpisodeOf
 from envs.testing.recorded import observation_problems
 from predictor.data.store import Episode, StoreInfo
 from predictor.scene import Scene
 from predictor.support.errors import UserError, one_line, run_entry_point
+from tests.envs import planted
 from tests.envs.semantics import read_crowd
 from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, by_distance
 
@@ -66,6 +69,30 @@ def test_each_planted_mistake_is_named_in_a_line(mistake: str):
 def test_mistakes_of_the_environment_are_named_too(name: str, sentence: str):
     found = problems_of(CheckConfig(f"tests.envs.planted:{name}"))
     assert any(sentence in line for line in found), found
+
+
+@pytest.mark.parametrize("method", ["reset", "see"])
+def test_what_a_reader_raises_is_named_whatever_it_does(method: str, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: Any) -> None:
+        raise IndexError("of a table")
+
+    walk = planted.Walk()
+    reader = reader_for(walk)
+    monkeypatch.setattr(type(reader), method, fail, raising=False)
+    (found,) = examine_reader(walk, None, episodes=1, max_steps=3, seed=0).problems
+    assert f"{method} failed with IndexError: of a table" in found
+
+
+def test_a_script_without_a_guard_does_not_end_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """sys.exit(0) at its end made the check succeed without a word."""
+    (tmp_path / "script_of_mine.py").write_text("import sys\nclass Env: pass\nsys.exit(0)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for env_id in ("script_of_mine:Env", "script_of_mine:Env-v0"):
+        with pytest.raises(UserError, match="cannot import 'script_of_mine' for .*: SystemExit: 0"):
+            problems_of(CheckConfig(env_id))
+    with pytest.raises(UserError, match="cannot import 'script_of_mine'"):
+        is_multiagent_id("script_of_mine:Env-v0")
+    assert not is_multiagent_id("nowhere_at_all:Env-v0")
 
 
 @pytest.mark.parametrize(
@@ -118,7 +145,7 @@ def test_the_command_ends_with_status_1_if_something_is_wrong(
     ("config", "sentence"),
     [
         ({"env_id": "CartPole-v1"}, "no scene reader knows CartPoleEnv"),
-        ({"env_id": "nowhere:Env-v0"}, "cannot make env 'nowhere:Env-v0'"),
+        ({"env_id": "nowhere:Env-v0"}, "cannot import 'nowhere' for 'nowhere:Env-v0'"),
         ({"env_id": "tests.envs.planted:a_number"}, "must give a gymnasium Env or a pettingzoo ParallelEnv, got int"),
         ({"env_id": "tests.envs.planted:Walk", "env_kwargs": '{"size": 3}'}, "unexpected keyword argument 'size'"),
         ({"env_id": "tests.envs.planted:Walk", "env_kwargs": "size=3"}, "env_kwargs must be a JSON object"),

@@ -113,6 +113,38 @@ def test_a_recording_does_not_go_on_with_a_driver_or_environment_that_has_change
     assert code == 2 and f"unfinished recording that differs in {setting}; repeat its command" in errors[0]
 
 
+def test_a_stop_before_the_first_new_episode_says_that_earlier_ones_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    def stop(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    words = ["--env-id", TAG, "--episodes", "3", "--max-steps", "3", "--workers", "1", "--out", str(tmp_path / "store")]
+    monkeypatch.setattr(collect, "_info_from", stop)
+    code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
+    assert code == 130
+    assert errors[-1] == "stopped: what an earlier start kept is still there; the same command goes on"
+
+
+def test_a_recording_that_another_one_has_finished_meanwhile_is_not_played_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    words = ["--env-id", TAG, "--episodes", "1", "--max-steps", "3", "--workers", "1", "--out", str(tmp_path / "store")]
+    made = collect._info_from
+
+    def made_while_another_ends(*arguments: Any) -> Any:
+        with monkeypatch.context() as other:
+            other.setattr(collect, "_info_from", made)
+            assert run_command(collect.main, words, other, capsys)[0] == 0
+        monkeypatch.setattr(collect, "recorded", lambda *_: pytest.fail("played"))
+        return made(*arguments)
+
+    monkeypatch.setattr(collect, "_info_from", made_while_another_ends)
+    code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
+    assert code == 2 and errors == [f"error: {tmp_path / 'store'} exists; choose another path or pass --overwrite"]
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
 def test_what_the_reader_says_of_its_scenes_is_a_setting_of_a_recording():
     made = config(env_id=TAG, out=Path("store"))
     info = collect._info(made, 0)

@@ -704,7 +704,7 @@ def binaries() -> Iterator[Case]:
     yield Case(s, "no model", _state(lambda s: void(s.pop("model"))), "model")
     yield Case(s, "model a number", _state(_set_key("model", value=5)), "model")
     yield Case(s, "optimizer a number", _state(_set_key("optimizer", value=5)), "optimizer")
-    yield Case(s, "optimizer without groups", _state(_set_key("optimizer", "param_groups", value=[])), "zip()")
+    yield Case(s, "optimizer without groups", _state(_set_key("optimizer", "param_groups", value=[])), "one group")
     yield Case(
         s, "optimizer without moments", _state(_set_key("optimizer", "state", value={0: {"step": 1}})), "optimizer"
     )

@@ -104,6 +104,30 @@ def test_saving_again_replaces(path: Path):
     assert [p.name for p in path.parent.iterdir()] == ["toy"]
 
 
+@pytest.mark.parametrize("beside", ["notes.txt", "train_state.pt", "checkpoint"])
+def test_what_is_no_checkpoint_alone_is_never_replaced(path: Path, tmp_path: Path, beside: str):
+    """A run folder, a folder of notes: all that they hold would be deleted."""
+    (path / beside).write_text("years of work")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    save_checkpoint(mine, made(), INFO)  # an empty folder
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "config.json").write_text("{}")
+    for folder, named in ((path, beside), (tmp_path / "other", "config.json"), (tmp_path, "mine")):
+        before = sorted(folder.rglob("*"))
+        with pytest.raises(UserError, match=f"holds {named} and is no checkpoint, which alone is replaced; choose"):
+            save_checkpoint(folder, made(1), INFO)
+        assert sorted(folder.rglob("*")) == before
+    assert (path / beside).read_text() == "years of work"
+
+
+def test_a_checkpoint_with_its_card_is_replaced(path: Path):
+    for name in ("README.md", "in_env.json"):
+        (path / name).write_text("{}")
+    save_checkpoint(path, made(1), INFO)
+    assert sorted(p.name for p in path.iterdir()) == ["config.json", "model.safetensors"]
+
+
 # --- Failed saves -----------------------------------------------------------------------------------------------------
 
 

@@ -2,9 +2,11 @@
 
 import multiprocessing
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -129,3 +131,29 @@ def test_a_worker_plays_one_episode_after_the_other():
     assert set(again) <= set(first)
     assert os.getpid() not in first
     assert 1 <= len(set(first)) <= 2
+
+
+def wait_if_first(task: Plain) -> int:
+    """Returns the seed; the first one takes a while."""
+    if task.seed == 0:
+        time.sleep(2.0)
+    return task.seed
+
+
+@pytest.mark.slow
+def test_episodes_behind_one_that_hangs_do_not_pile_up(monkeypatch: pytest.MonkeyPatch):
+    """They wait in memory, and are lost when the command is stopped."""
+    monkeypatch.setattr(workers, "MOST_AHEAD", 4)
+    handed: list[int] = []
+    with EpisodePool(wait_if_first, 2) as pool:
+        hand_out = pool._hand_out
+
+        def spied(*arguments: Any) -> None:
+            hand_out(*arguments)
+            handed.append(max([worker.number for worker in pool._workers if worker.number is not None], default=0))
+
+        monkeypatch.setattr(pool, "_hand_out", spied)
+        results = pool.results([Plain(seed) for seed in range(40)])
+        assert next(results) == 0
+        assert max(handed) < 8
+        assert list(results) == list(range(1, 40))

@@ -1,11 +1,13 @@
 import re
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from predictor.data import partial_store
 from predictor.data.partial_store import SETTINGS, PartialStore, beside
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
@@ -46,6 +48,21 @@ def test_a_recording_that_was_stopped_twice_equals_one_that_was_not(tmp_path: Pa
         assert (found.seed, found.label) == (expected.seed, expected.label)
         for name in ("states", "valid", "ids"):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_a_signal_while_a_part_is_written_waits_until_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Else the part was written again on the way out, which the one that is there refused."""
+    written = partial_store.write_store
+
+    def interrupted(*arguments: Any) -> None:
+        written(*arguments)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(partial_store, "write_store", interrupted)
+    with pytest.raises(KeyboardInterrupt), PartialStore(tmp_path / "store", SETTINGS_A, part_s=0.0) as partial:
+        partial.add(INFO, episodes()[0])
+    monkeypatch.undo()
+    assert PartialStore(tmp_path / "store", SETTINGS_A).num_done == 1
 
 
 def test_a_short_recording_leaves_no_parts(tmp_path: Path):

@@ -20,6 +20,7 @@ from predictor.data.store import (
     PERTURBATIONS,
     Episode,
     StoreInfo,
+    _check_arrays,
     content_id,
     read_info_of,
     read_store,
@@ -520,6 +521,39 @@ def test_what_is_no_store_is_never_replaced(tmp_path: Path, make: Any):
     with pytest.raises(UserError, match="store is not an episode store and will not be replaced; choose another path"):
         write_store(tmp_path / "store", INFO, [episode(1)], overwrite=True)
     assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.parametrize("beside", ["notes.txt", ".other.unfinished", "highway"])
+def test_what_lies_in_a_store_s_folder_is_not_lost(tmp_path: Path, beside: str):
+    write_store(tmp_path / "store", INFO, [episode(1)])
+    if beside == "notes.txt":
+        (tmp_path / "store" / beside).write_text("mine")
+    else:
+        write_store(tmp_path / "store" / beside, INFO, [episode(2)])
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UserError, match=f"store also holds {beside}, which is no part of the store and would be lost"):
+        write_store(tmp_path / "store", INFO, [episode(3)], overwrite=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [
+        ("starts", np.array([0, 100, -56, 44], np.int8)),
+        ("starts", np.array([0, 2**62, -(2**63), 44], np.int64)),
+        ("starts", np.array([0, 20, 20, 44])),
+        ("label_starts", np.array([0, 100, -56, 44], np.int8)),
+    ],
+)
+def test_where_episodes_begin_must_rise(name: str, places: np.ndarray):
+    """Also where differences of their type wrap around: 44 steps would be read as 88."""
+    arrays = {
+        "states": np.zeros((44, 3, 4)), "starts": np.array([0, 4, 24, 44]), "ids": np.arange(9).reshape(3, 3),
+        "edge_types": np.zeros((44, 3, 3), np.int8), "label_starts": np.array([0, 4, 24, 44]),
+    }  # fmt: skip
+    _check_arrays(Path("store"), arrays)
+    with pytest.raises(UserError, match=f"store: '{name}' must rise from 0 to 44"):
+        _check_arrays(Path("store"), arrays | {name: places})
 
 
 STOPPED_WHILE_ZARR_STARTS = """

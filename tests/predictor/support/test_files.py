@@ -18,6 +18,7 @@ from predictor.support.errors import CannotWriteError, UserError
 from predictor.support.files import (
     check_out,
     check_out_file,
+    check_place,
     copy_file,
     delete_leftovers,
     finite,
@@ -196,3 +197,17 @@ def test_an_output_without_permission_is_refused_before_the_work(
     with pytest.raises(UserError, match=f"cannot be used: no permission to write in {tmp_path}; choose another --out"):
         check(tmp_path / "new" / "out")
     assert asked == [tmp_path], "the folder above, which is there"
+
+
+@pytest.mark.parametrize(("letters", "suffix", "fits"), [(230, "", True), (240, "", False), (233, ".json", False)])
+def test_a_name_whose_unfinished_file_is_too_long_is_refused_before_the_work(
+    tmp_path: Path, letters: int, suffix: str, fits: bool
+):
+    out = tmp_path / ("n" * letters + suffix)
+    if fits:
+        check_place(out)
+        with new_folder(out):
+            pass
+        return
+    with pytest.raises(UserError, match="its name is too long; choose another path"):
+        check_place(out)

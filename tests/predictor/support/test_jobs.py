@@ -85,6 +85,16 @@ def test_each_task_ends_with_its_reason(tmp_path: Path):
     ]
 
 
+@pytest.mark.parametrize("name", [LOG_FILE, ".lock"])
+def test_a_planted_link_is_not_written_through(tmp_path: Path, name: str):
+    (tmp_path / "victim").write_text("years of work")
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / name).symlink_to(tmp_path / "victim")
+    with pytest.raises(UserError, match=f"task/{name} must be a file of its own, not a link or a pipe; remove it"):
+        list(run_tasks([Toy(tmp_path / "task")], workers=1))
+    assert (tmp_path / "victim").read_text() == "years of work"
+
+
 @pytest.mark.slow
 def test_tasks_wait_for_those_that_they_need(tmp_path: Path):
     tasks = [Toy(tmp_path / "last", ("first", "second")), Toy(tmp_path / "first"), Toy(tmp_path / "second", ("first",))]

@@ -71,6 +71,25 @@ def test_ctrl_c_while_a_lock_is_taken_leaves_none(tmp_path: Path, monkeypatch: p
         pass
 
 
+@pytest.mark.parametrize("planted", ["symlink", "hard link", "pipe"])
+def test_a_planted_lock_writes_over_nothing(tmp_path: Path, planted: str):
+    """In a stranger's run folder it may lead to a file of the user's."""
+    victim, folder = tmp_path / "victim", tmp_path / "run"
+    victim.write_text("years of work")
+    folder.mkdir()
+    for lock in (folder / ".lock", tmp_path / ".store.lock"):
+        if planted == "symlink":
+            lock.symlink_to(victim)
+        elif planted == "hard link":
+            os.link(victim, lock)
+        else:
+            os.mkfifo(lock)
+    for held in (lambda: locked(folder, "training"), lambda: locked_path(tmp_path / "store")):
+        with pytest.raises(UserError, match="lock must be a file of its own, not a link or a pipe; remove it"), held():
+            raise AssertionError
+    assert victim.read_text() == "years of work"
+
+
 def test_the_last_of_several_threads_gives_a_lock_back(tmp_path: Path):
     """Two threads of one process hold it at once; the first to leave takes nothing from the other."""
     first, second = locked_path(tmp_path / "store"), locked_path(tmp_path / "store")
