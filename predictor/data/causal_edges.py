@@ -14,6 +14,8 @@ DRIVER_ATTRIBUTES = ("desired_speed_mps", "time_gap_s")
 """Attributes of a leader's edge, as recorded (docs/datasets/env.md), that become attributes of causal edges."""
 CAUSAL_ATTRIBUTES = ("desired_speed_mps", "causal_strength", "leader", "time_gap_s")
 """Attributes of causal edges. First is what does not change within a pair, for pair matching (`static_dim=1`)."""
+YIELDED = "desired_speed_mps"
+"""Attribute that highway-env sets to 0 while a driver yields."""
 STRENGTH = CAUSAL_ATTRIBUTES.index("causal_strength")
 """Column of the strength."""
 
@@ -48,6 +50,12 @@ def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> 
     return EpisodeStore(info, episodes)
 
 
+def known(attribute: Float[np.ndarray, "*edges"], name: str) -> Float[np.ndarray, "*edges"]:
+    """Returns an attribute with NaN where it is not known: what a driver wishes that yields is not recorded."""
+    return np.where(attribute <= 0, np.nan, attribute) if name == YIELDED else attribute
+
+
+
 def _with_causal_edges(episode: Episode, threshold_m: float | None, columns: list[int] | None) -> Episode:
     """Returns an episode with causal edges; `columns` are those of the drivers' attributes, None without any."""
     types = None if columns is None else episode.edge_types
@@ -60,8 +68,6 @@ def _with_causal_edges(episode: Episode, threshold_m: float | None, columns: lis
     if types is not None and columns is not None and episode.edge_attributes is not None:
         attributes[..., CAUSAL_ATTRIBUTES.index("leader")] = np.where(types < 0, np.nan, types > 0)
         for name, column in zip(DRIVER_ATTRIBUTES, columns, strict=True):
-            of_driver = np.where(types > 0, episode.edge_attributes[..., column], np.nan)
-            if name == "desired_speed_mps":  # 0 while a driver yields: what it wishes on a free road is not recorded
-                of_driver[of_driver <= 0] = np.nan
-            attributes[..., CAUSAL_ATTRIBUTES.index(name)] = of_driver
+            of_driver = known(episode.edge_attributes[..., column], name)
+            attributes[..., CAUSAL_ATTRIBUTES.index(name)] = np.where(types > 0, of_driver, np.nan)
     return replace(episode, edge_types=causal_types(shift_m, threshold_m or np.inf), edge_attributes=attributes)

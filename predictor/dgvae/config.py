@@ -44,7 +44,7 @@ class DGVAEConfig:
     temperature: float = 0.5
     """Temperature of the concrete distribution."""
     dropout: float = 0.0
-    """Dropout probability after the LSTM."""
+    """Dropout probability after the LSTM of pairs; what an agent's own memory gives its modes has none."""
     residual: Residual = "state"
     """Position to which the predicted change is added: the current one (paper), or the current one moved on at the
     current velocity, or at the mean of current and predicted velocity (velocity-consistent)."""
@@ -54,7 +54,8 @@ class DGVAEConfig:
     """Spread of each feature over the map [SI], which divides the network's inputs; empty takes the spec's feature
     scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
-    """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
+    """Typical one-step change of each feature [SI], of the ego's axes in the world; if given, the change of each input
+    since the last step is an encoder input too."""
     changes_of_place: bool = False
     """Whether a position's change is that of the agent's place on "centroid" axes as well, whose origin jumps when an
     agent comes or goes. New networks have it there; checkpoints of before take the change in the frame."""
@@ -149,11 +150,12 @@ class DGVAEConfig:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 
     def in_units(self, attributes: Float[Tensor, "*pairs attributes"]) -> Float[Tensor, "*pairs attributes"]:
-        """Returns edge attributes in the units of the feature dimensions that learn them."""
+        """Returns edge attributes in the units of the feature dimensions that learn them; NaN where none learns one."""
         if not self.label_scales:
             return attributes
-        of_each = enumerate(zip(self.label_means, self.label_scales, strict=True))
-        return torch.stack([(attributes[..., i] - mean) / scale for i, (mean, scale) in of_each], dim=-1)
+        of_each = enumerate(zip(self.feature_labels, self.label_means, self.label_scales, strict=True))
+        units = [(attributes[..., i] - mean) / (scale if name else math.nan) for i, (name, mean, scale) in of_each]
+        return torch.stack(units, dim=-1)
 
     def with_units(self, features: Float[Tensor, "*pairs dims"]) -> Float[Tensor, "*pairs dims"]:
         """Returns edge features whose first dimensions are their attributes, in the attributes' units."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from predictor.data.causal_edges import known
 from predictor.data.windows import WindowBatch, Windows
 from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluation.edge_scores import (
@@ -229,9 +230,11 @@ def _scores(
         relation = score_factor("edge exists", every.features, exists, every.group, every.distance_m, leads, seed)
         apart = separation(every.features, every.edge_prob, every.exists)
         edges = every.where(every.exists)
-    edges = edges.where(np.isfinite(edges.attributes).all(axis=1))
     count = edges.attributes.shape[1]
     titles = [names[i] if i < len(names) else f"attribute {i}" for i in range(count)]
+    if count:
+        told = np.stack([known(edges.attributes[:, i], title) for i, title in enumerate(titles)], axis=1)
+        edges = edges.where(np.isfinite(told).all(axis=1))
     dimensions = [_learned_by(title, learned) if learned else i for i, title in enumerate(titles)]
     attributes = [
         score_factor(title, edges.features, edges.attributes[:, i], edges.group, edges.distance_m, dimension, seed)

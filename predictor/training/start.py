@@ -44,13 +44,14 @@ def _labels(config: TrainConfig, episodes: Sequence[Episode], learned: Any = Non
     Args:
         config: the training's config.
         episodes: episodes to which mean and standard deviation of each attribute are fitted.
-        learned: config of a network whose weights are kept; those of attributes that it has learned stay as they are.
+        learned: config of a network whose weights are kept; those of attributes that it has learned stay as they are,
+            also where the data do not know them.
     """
     if not (config.label_weight and config.causal_edges):
         return {}
     found = [typical_label(episodes, column) for column in range(len(CAUSAL_ATTRIBUTES))]
     for column, name in enumerate(CAUSAL_ATTRIBUTES if learned and learned.label_means else ()):
-        if found[column] and learned.feature_labels[column : column + 1] == (name,):
+        if learned.feature_labels[column : column + 1] == (name,):
             found[column] = learned.label_means[column], learned.label_scales[column]
     names = (name if label else "" for name, label in zip(CAUSAL_ATTRIBUTES, found, strict=True))
     means, scales = zip(*(label or (0.0, 1.0) for label in found), strict=True)
@@ -78,6 +79,12 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
         if config.refit_scales:
             fitted = model_config(replace(config, set=(f"residual={info.config.residual}",)), spec, episodes)
             source = rescaled(source, info.model, {name: getattr(fitted, name) for name in SCALES}, info.horizon_steps)
+        taught = any(getattr(source.config, "feature_labels", ()))
+        if config.label_weight and taught and not config.causal_edges:
+            raise UserError(
+                f"features of checkpoint '{config.init}' have learned causal attributes, which label_weight would teach "
+                "those of the store; pass --causal-edges, or leave --label-weight out"
+            )
         network = changed(replace(source.config, **_labels(config, episodes, source.config)), config.set)
         _check_learns(config, network, episodes)
         plain = build(info.model, spec, network, config.horizon_steps)

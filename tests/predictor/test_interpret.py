@@ -326,6 +326,22 @@ def test_batches_do_not_matter():
     assert whole.stillness.within == pytest.approx(parts.stillness.within, abs=1e-5)
 
 
+def test_drivers_that_yield_do_not_count_as_wishing_to_stand():
+    """As in training: 0 m/s is what highway-env writes while a driver yields, not what it wishes."""
+
+    def scored(name: str) -> Any:
+        episodes = [labelled_episode(i) for i in range(6)]
+        for episode in episodes:
+            assert episode.edge_attributes is not None
+            episode.edge_attributes[:, 0] = 0.0
+        windows = Windows(episodes, spec(has_ego=False), 4, 2, 2, 4)
+        return measure(DistanceModel(), windows, [np.arange(len(windows))], (name,))[0].attributes[0]
+
+    wish, other = scored("desired_speed_mps"), scored("distance_m")
+    assert wish.direct_r2 == pytest.approx(1.0) and other.direct_r2 < 0.9
+    assert 0 < wish.pairs < other.pairs
+
+
 def test_a_feature_in_another_unit_is_read_with_a_line():
     class Inches(DistanceModel):
         def observe(self, memory: Memory, states: torch.Tensor, valid: torch.Tensor) -> tuple[Memory, Belief]:

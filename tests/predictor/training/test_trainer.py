@@ -751,6 +751,28 @@ def test_features_that_are_learned_keep_their_unit(tmp_path: Path):
     assert after.feature_labels == ("desired_speed_mps", "", "leader", "time_gap_s")
     assert (after.label_means[0], after.label_scales[0]) == (before.label_means[0], before.label_scales[0])
     assert before.label_means[0] < 30 and after.label_means[3] > 2
+    mute = write_followers(tmp_path / "three", speed_mps=0.0)  # drivers that yield throughout: their wish is not known
+    kept = made(config(mute, tmp_path / "third", init=str(first), **LABELS)).model.config
+    assert kept.feature_labels[0] == "desired_speed_mps"
+    assert (kept.label_means[0], kept.label_scales[0]) == (before.label_means[0], before.label_scales[0])
+
+
+def test_an_attribute_that_never_varies_is_not_learned(tmp_path: Path):
+    """Its error, in no unit, was hundreds of times as large as that of all others."""
+    trainer = made(config(write_followers(tmp_path / "followers"), tmp_path / "first", **LABELS))
+    learned = trainer.model.config
+    units = learned.in_units(torch.ones(2, len(learned.feature_labels)))
+    assert [bool(column.isnan().all()) for column in units.T] == [not name for name in learned.feature_labels]
+    assert float(trainer.train_step()["label"]) < 10
+
+
+def test_learned_causal_features_are_not_taught_the_attributes_of_a_store(tmp_path: Path):
+    """They stand in other columns: a time gap would be taught as a wished speed."""
+    data = write_followers(tmp_path / "followers")
+    first = str(train(config(data, tmp_path / "first", **LABELS)))
+    with pytest.raises(UserError, match="have learned causal attributes, .*; pass --causal-edges, or leave"):
+        made(config(data, tmp_path / "second", init=first, label_weight=1.0))
+    made(config(data, tmp_path / "second", init=first))
 
 
 def test_more_attributes_than_features_are_refused_before_a_run_is_made(tmp_path: Path):
