@@ -82,8 +82,8 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
         taught = any(getattr(source.config, "feature_labels", ()))
         if config.label_weight and taught and not config.causal_edges:
             raise UserError(
-                f"features of checkpoint '{config.init}' have learned causal attributes, which label_weight would teach "
-                "those of the store; pass --causal-edges, or leave --label-weight out"
+                f"features of checkpoint '{config.init}' have learned causal attributes, and label_weight would teach "
+                "them those of the store; pass --causal-edges, or leave --label-weight out"
             )
         network = changed(replace(source.config, **_labels(config, episodes, source.config)), config.set)
         _check_learns(config, network, episodes)
