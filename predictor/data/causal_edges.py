@@ -55,7 +55,6 @@ def known(attribute: Float[np.ndarray, "*edges"], name: str) -> Float[np.ndarray
     return np.where(attribute <= 0, np.nan, attribute) if name == YIELDED else attribute
 
 
-
 def _with_causal_edges(episode: Episode, threshold_m: float | None, columns: list[int] | None) -> Episode:
     """Returns an episode with causal edges; `columns` are those of the drivers' attributes, None without any."""
     types = None if columns is None else episode.edge_types

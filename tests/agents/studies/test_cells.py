@@ -6,8 +6,9 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents.presets import PPOPreset, QRDQNPreset
-from agents.studies.cells import NETWORK, Cell, cells_of
+from agents.studies.cells import NETWORK, Cell, cells_of, run_cell
 from agents.studies.plan import read_study
+from agents.studies.results import read_result
 from envs.drivers.content import content_of_module
 from envs.drivers.planner import PlannerConfig
 from envs.registry import make_env
@@ -228,3 +229,13 @@ def test_only_uneven_measurements_have_another_name(cells: Callable[..., list[Ce
 def test_where_there_is_a_choice_its_rule_is_in_the_name(cells: Callable[..., list[Cell]]):
     assert "kept" not in next(c for c in cells(steps="512", selections="1") if c.plan).content
     assert next(c for c in cells(steps="512", selections="2") if c.plan).content["kept"] == "highest mean"
+
+
+def test_a_result_says_what_the_file_said(cells: Callable[..., list[Cell]], tmp_path: Path):
+    """By it `--report` tells results of other settings apart."""
+    for cell in (cells()[0], cells()[-1]):
+        assert cell.settings and cell.settings["episodes"] == cell.episodes
+        assert ("steps" in cell.settings) == (cell.plan is not None)
+    driver = cells()[0]
+    assert run_cell(driver, tmp_path / "cell", "commit").settings == driver.settings
+    assert read_result(tmp_path / "cell" / "result.json").settings == driver.settings
