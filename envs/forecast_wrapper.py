@@ -18,7 +18,8 @@ class ForecastWrapper:
     """Base of `ForecastObservation`, `ForecastParallelEnv`, `VecForecast` and `VectorForecast`.
 
     A deep copy continues exactly as the original would, and shares only the forecaster, which no step changes. A pickle
-    continues exactly too, and contains the forecaster's weights.
+    continues exactly too, and contains the forecaster's weights. An environment of highway-env that has been rendered
+    cannot be pickled until it is closed (highway-env's window cannot); a copy can be made.
 
     Attributes:
         stream: history and noise of each environment.

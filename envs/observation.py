@@ -29,7 +29,7 @@ def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
     agents = spec.max_agents
     return {
         "scene_states": gym.spaces.Box(-np.inf, np.inf, (agents, spec.num_features), np.float64),
-        "scene_ids": gym.spaces.Box(-1, np.iinfo(np.int64).max, (agents,), np.int64),
+        "scene_ids": gym.spaces.Box(-1, np.iinfo(np.int64).max - 1, (agents,), np.int64),  # or it has no samples
         "scene_valid": gym.spaces.MultiBinary(agents),
         "scene_heading_rad": gym.spaces.Box(-np.inf, np.inf, (1,), np.float64),
     }

@@ -124,6 +124,20 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
+    def pictured(self, num_samples: int) -> Forecast:
+        """Returns a forecast of the latest scene with this number of samples, to be drawn; no noise is used up.
+
+        Raises:
+            UserError: copies share a forward, which has the number of samples of their observations.
+        """
+        if self._forward is not None:
+            own = self.stream.config.num_samples
+            raise UserError(
+                f"this environment shares its forecasts with other copies (ParallelVecEnv), with num_samples={own}; "
+                f"film with num_samples={own}, or an environment of its own"
+            )
+        return self.stream.pictured(num_samples)
+
     @property
     def reader(self) -> MultiagentReader:
         """Reader of the scenes."""

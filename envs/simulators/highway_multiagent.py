@@ -22,7 +22,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo import ParallelEnv
 
 from envs.simulators.highway_settings import check_settings
-from predictor.support.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError, short
 
 INTERSECTION = "intersection-multi-agent-v2"
 """Id whose drivers react to vehicles on connected lanes, as on intersection-v2."""
@@ -120,13 +120,17 @@ class HighwayParallelEnv(ParallelEnv):
 
         Raises:
             ProtocolError: no agent lives: before the first reset, or after the last one is gone.
-            UserError: a living agent has no action.
+            UserError: a living agent has no action, or one that it does not have.
         """
         if not self.agents:
             raise ProtocolError("no agent is on the road; call reset() first")
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise UserError(f"step needs an action for each living agent, {', '.join(missing)} had none")
+        for agent in self.agents:
+            space, given = self.action_space(agent), np.asarray(actions[agent])
+            if isinstance(space, gym.spaces.Discrete) and not (given.size == 1 and given.item() in range(int(space.n))):
+                raise UserError(f"{agent} has no action {short(repr(actions[agent]), 60)}; it has {space}")
         joint = tuple(
             actions[agent] if agent in self.agents else self.idle_action(agent) for agent in self.possible_agents
         )

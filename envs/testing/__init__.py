@@ -16,7 +16,8 @@ from envs.testing.motion import lasting_share
 from envs.testing.names import name_problems, obedience_problems
 from envs.testing.playing import open_reader, play, shown_spaces, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
-from predictor.support.errors import UserError
+from predictor.support.config_checks import is_whole
+from predictor.support.errors import UserError, short
 
 __all__ = ["Examined", "check_reader", "examine_reader", "reader_problems", "recorded_problems", "store_problems"]
 
@@ -75,8 +76,11 @@ def examine_reader(
     The arguments are those of `check_reader`.
 
     Raises:
-        UserError: no reader knows the env.
+        UserError: no reader knows the env, or there is not one episode of a step.
     """
+    for name, number in (("episodes", episodes), ("max_steps", max_steps)):
+        if not is_whole(number) or number < 1:
+            raise UserError(f"{name} must be a whole number from 1 on, got {short(repr(number), 60)}")
     opened = open_reader(env, reader)
     problems: list[str] = []
     try:

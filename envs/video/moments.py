@@ -55,7 +55,7 @@ def bodies_now(
     """
     scene, spec = env.scene, env.scene_spec
     has_as_many = env.forecast.xy.shape[1] == num_samples
-    forecast = env.forecast if has_as_many else env.stream.pictured(num_samples)
+    forecast = env.forecast if has_as_many else env.pictured(num_samples)
     states = scene.scene.states
     xy_m = forecast.xy[0].double().cpu().numpy().swapaxes(0, 1)
     shares = forecast.sample_probs()[0].double().cpu().numpy().T

@@ -14,9 +14,10 @@ from envs.parallel import ForecastParallelEnv, batch_forwards
 from envs.readers.base import MultiagentScene
 from envs.sb3 import agents_as_rows
 from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.video.moments import bodies_now
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import Scene
-from predictor.support.errors import ProtocolError
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import assert_same, tiny_model
 from tests.envs.test_parallel import WORLD, Life, Toy, ToyReader, act, wrap
 
@@ -122,6 +123,16 @@ def stepped_together() -> ParallelVecEnv:
     venv.reset()
     play(venv, 3)
     return venv
+
+
+def test_a_film_of_one_of_several_copies_shows_their_forecast_or_none():
+    """Its own stream is of before they shared one: another number of futures was one of an earlier episode."""
+    together = stepped_together()
+    one = together.envs[1]
+    drawn = bodies_now(one, None, {}, one.forecast.xy.shape[1])
+    assert all(np.isfinite(body.forecast_m).all() for body in drawn.values()) and drawn
+    with pytest.raises(UserError, match=r"shares its forecasts with other copies .*; film with num_samples=4, or an"):
+        bodies_now(one, None, {}, 7)
 
 
 @pytest.mark.parametrize("copied", [False, True], ids=["itself", "a deep copy"])

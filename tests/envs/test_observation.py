@@ -355,6 +355,7 @@ def test_scenes_survive_the_way_through_an_observation():
     singles = [Scene(batch.states[i], batch.ids[i], batch.valid[i], float(batch.heading_rad[i])) for i in range(3)]
     entries = [scene_entries(s) for s in singles]
     spaces = scene_spaces(SceneSpec(dt_s=1.0, max_agents=5))
+    assert all(space.contains(space.sample()) for space in spaces.values())
     assert tuple(spaces) == SCENE_KEYS
     assert all(space.contains(entries[0][key]) for key, space in spaces.items())
     back = scenes_from({key: np.stack([e[key] for e in entries]) for key in SCENE_KEYS})

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from types import FrameType, SimpleNamespace
 from typing import Any
 
@@ -231,3 +232,13 @@ def test_no_step_loops_over_rows_in_python():
 def test_a_loop_over_rows_would_be_found():
     few, many = (instructions(rows, lambda rows: [row for row in range(rows)]) for rows in (FEW, MANY))
     assert many - few > 2 * (MANY - FEW)
+
+
+def test_what_the_simulator_writes_later_changes_no_scene():
+    given = AgentTensors(np.ones((2, 3, 4)), np.ones((2, 3), bool), np.tile(np.arange(3), (2, 1)), np.zeros(2))
+    scenes = TensorReader(SceneSpec(dt_s=1.0, max_agents=3)).read(given, np.arange(2))
+    before = deepcopy(scenes)
+    for array in (given.states, given.valid, given.ids, given.heading_rad):
+        array[:] = 0 if array.dtype == bool else array + 1
+    for name in ("states", "valid", "ids", "heading_rad"):
+        np.testing.assert_array_equal(getattr(scenes, name), getattr(before, name))

@@ -201,6 +201,10 @@ def test_driving_it_out_of_order_is_named():
     env.reset(seed=0)
     with pytest.raises(UserError, match="an action for each living agent, vehicle_1 had none"):
         env.step({"vehicle_0": IDLE})
+    for wrong in (99, -1, "idle", None, [0, 1], 0.5):
+        with pytest.raises(UserError, match=r"vehicle_0 has no action .*; it has Discrete\(3\)"):
+            env.step({"vehicle_0": wrong, "vehicle_1": IDLE})
+    env.step({"vehicle_0": np.int64(IDLE), "vehicle_1": np.array(IDLE)})
     env.agents = []
     with pytest.raises(ProtocolError, match="no agent is on the road"):
         env.step({"vehicle_0": IDLE, "vehicle_1": IDLE})

@@ -519,3 +519,10 @@ def test_positions_that_a_recording_would_round_are_told():
     assert (
         line.startswith("positions of up to 5,400,0") and "in steps of 0.5 m (float32); subtract a fixed place" in line
     )
+
+
+@pytest.mark.parametrize("numbers", [{"episodes": 0}, {"max_steps": 0}, {"episodes": 1.5}, {"max_steps": True}])
+def test_there_must_be_a_step_to_look_at(numbers: dict[str, Any]):
+    (name,) = numbers
+    with pytest.raises(UserError, match=f"{name} must be a whole number from 1 on, got"):
+        check_reader(make_env("highway-fast-v0"), **numbers)
