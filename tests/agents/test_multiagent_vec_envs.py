@@ -1,8 +1,9 @@
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from pettingzoo import ParallelEnv
 
 from agents.arena import MultiagentArena
 from agents.task import Task
@@ -204,6 +205,39 @@ def test_copies_side_by_side_play_as_one_after_the_other(observe: Any):
     assert facts(results) == facts(MultiagentArena(task, most_copies=1).play(model, range(3, 8)))
     assert len({r.episode_return for r in results}) > 1 and len(calls) == 5
     together.close()
+
+
+class Lengths(ParallelEnv):
+    """Pays 1 per step, for as many steps as the seed says."""
+
+    metadata: ClassVar = {"name": "lengths", "render_modes": []}
+    render_mode = None
+    possible_agents: ClassVar = ["a_0", "a_1"]
+
+    def observation_space(self, agent: str) -> gym.Space:
+        return gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def action_space(self, agent: str) -> gym.Space:
+        return gym.spaces.Discrete(2)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents, self.left = list(self.possible_agents), int(np.random.default_rng(seed).integers(2, 7))
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {agent: {} for agent in self.agents}
+
+    def step(self, actions: Any) -> Any:
+        self.left -= 1
+        each, ended = list(self.agents), self.left == 0
+        self.agents = [] if ended else each
+        seen, rewards = {agent: np.zeros(2, np.float32) for agent in each}, dict.fromkeys(each, 1.0)
+        return seen, rewards, dict.fromkeys(each, ended), dict.fromkeys(each, False), {agent: {} for agent in each}
+
+
+def test_a_copy_that_is_done_earns_nothing_of_its_next_episode():
+    task = Task(f"{__name__}:Lengths", "none")
+    model = policy_for(task)
+    together, alone = (MultiagentArena(task, most_copies=copies).play(model, range(5)) for copies in (3, 1))
+    assert facts(together) == facts(alone) and len({r.length for r in alone}) > 1
+    assert all(r.episode_return == r.length for r in together)
 
 
 def test_a_policy_is_played_as_in_a_plain_loop():

@@ -11,10 +11,12 @@ from agents.arena import MultiagentArena, run_episodes
 from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, SeededEpisodes, make_venv
 from envs import readers
+from envs.drivers.ego import make_ego_driver
 from envs.readers.function import FunctionReader
 from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
 from envs.sb3 import envpool as envpool_module
+from envs.seeding import driver_rng
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
@@ -302,3 +304,15 @@ def test_a_reset_does_not_change_the_last_observation(observe: Any, copies: int,
         closing = info["terminal_observation"]
         assert (closing["observation"] if isinstance(closing, dict) else closing).tolist() == [3.0]
     venv.close()
+
+
+def test_the_random_driver_draws_from_the_seed_of_its_episode():
+    """With one seed for all, fifty episodes would be one."""
+    returns = []
+    for seed in range(3, 9):
+        env = Dice()
+        env.reset(seed=seed)
+        driver = make_ego_driver("random", env, driver_rng(seed))
+        returns.append(float(sum(int(driver(None)) for _ in range(env._left))))
+        assert run_episodes(dice_venv(1), "random", [seed])[0].episode_return == returns[-1]
+    assert len(set(returns)) > 2

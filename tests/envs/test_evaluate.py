@@ -76,6 +76,15 @@ def test_reduction_closed_form():
     assert found.interval == pytest.approx((0.25, 0.75))
 
 
+def test_forecasts_that_break_off_are_in_no_reduction():
+    """They are in none of the errors beside it: shorter ones are smaller."""
+    known = torch.ones(1, 2, HORIZON, dtype=torch.bool)
+    known[0, 1, -1] = False
+    model, straight = outcome(1.0), outcome(4.0)
+    model.forecast[:, :, 1, :, 0] = 9.0
+    assert reduced([replace(model, valid=known)] * 2, [replace(straight, valid=known)] * 2).value == pytest.approx(0.75)
+
+
 def test_one_episode_has_no_interval_and_no_error_no_reduction():
     assert _reduction([outcome(1.0)], [outcome(4.0)]) == Estimate(0.75, None)
     assert _reduction([outcome(1.0)] * 2, [outcome(0.0)] * 2) is None

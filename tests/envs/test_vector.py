@@ -535,3 +535,24 @@ def test_gymnasium_needs_no_stable_baselines():
     done = subprocess.run([sys.executable, "-c", WITHOUT_SB3], capture_output=True, text=True, timeout=90)
     assert done.returncode == 0, done.stderr
     assert "(2, 11, 5, 2)" in done.stdout
+
+
+def test_a_reset_after_an_end_begins_anew(highway_checkpoint: str):
+    """In the mode in which the next step would have: that step is not taken for the reset a second time."""
+    env, fresh = (vector(AutoresetMode.NEXT_STEP, highway_checkpoint) for _ in range(2))
+    fresh.reset(seed=SEED)
+    expected = fresh.step(ACTIONS[0])[0]
+    env.reset(seed=SEED)
+    assert any(np.logical_or(*env.step(actions)[2:4]).any() for actions in ACTIONS)
+    env.reset(seed=SEED)
+    assert_same(env.step(ACTIONS[0])[0], expected)
+
+
+def test_a_seed_for_some_environments_leaves_the_noise_of_the_others_alone(highway_checkpoint: str):
+    env, untouched = (vector(AutoresetMode.DISABLED, highway_checkpoint, num_samples=4) for _ in range(2))
+    for each in (env, untouched):
+        each.reset(seed=SEED)
+    env.reset(seed=5, options={"reset_mask": np.array([False, True, False])})
+    found, expected = env.step(ACTIONS[0])[0], untouched.step(ACTIONS[0])[0]
+    for place in (0, 2):
+        assert_same(one_of(found, place), one_of(expected, place))

@@ -398,3 +398,13 @@ def test_noise_that_was_fitted_to_fewer_steps_is_refused():
     belief = observed(made("residual"), *scenes())
     with pytest.raises(UserError, match="the noise was fitted to 3 steps, got horizon_steps=4"):
         rollout_plans(made("residual"), belief, torch.zeros(BATCH, 1, HORIZON + 1, 4))
+
+
+@pytest.mark.parametrize("kind", ["dgvae", "dgvae-neighbours", "dgvae-frozen"])
+def test_the_first_step_of_every_draw_is_that_without_plans(kind: str):
+    """No plan can change it, so the memory that a roll-out begins with is the same."""
+    belief, plans = observed(made(kind), *scenes()), plans_for()
+    planned = rollout_plans(made(kind), belief, plans, 4, noise()).states[:, :, :, 1:, 0]
+    plain = made(kind).rollout(belief, HORIZON, 4, noise()).states[:, None, :, 1:, 0].expand_as(planned)
+    there = belief.valid[:, None, None, 1:].expand(planned.shape[:4])
+    torch.testing.assert_close(planned[there], plain[there], **CLOSE)

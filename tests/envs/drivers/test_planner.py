@@ -23,7 +23,7 @@ from envs.plans import Plans
 from envs.readers.entities import EntityRowsReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import load_checkpoint
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -228,6 +228,21 @@ def test_environments_and_models_that_do_not_fit_are_refused():
 def test_what_a_planner_is_not_made_of_is_one_sentence(given: Any, message: str):
     with pytest.raises(UserError, match=message):
         given(make_env("highway-fast-v0"), ConstantVelocity(ROAD))
+
+
+def test_samples_come_from_the_planner_s_own_generator():
+    """A driver's generator is of its episode's seed: with one for all, all episodes had one noise."""
+    env = make_env("highway-fast-v0")
+    env.reset(seed=0)
+    drawing = NoisyConstantVelocity(ROAD, 3.0, 1.0)
+
+    def survival(rng: np.random.Generator | None) -> Any:
+        planner = Planner(env, drawing, rng=rng, config=PlannerConfig(num_samples=50))
+        planner()
+        return planner.survival
+
+    one, same, other = (survival(np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
 def test_a_planner_takes_the_name_of_a_checkpoint():

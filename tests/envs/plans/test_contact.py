@@ -1,6 +1,7 @@
 """Contacts: gaps of rectangles in closed form, the first contact, and probabilities over modes and draws."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -156,3 +157,11 @@ def test_a_slow_agent_turns_whatever_the_length_of_a_step(dt_s: float):
     scenes = SceneBatch(states, np.array([[0, 1]]), np.ones((1, 2), dtype=np.bool_), np.zeros(1))
     found = contacts(forecast, scenes, dt_s=dt_s)
     assert found.gap_m[0, 0, 0, 0] == pytest.approx(0.9, abs=0.05) and found.risk()[0, 0, 0] == 0
+
+
+def test_an_ego_at_rest_faces_as_the_scene_says():
+    """Along y it reaches 2.5 m to the side, along x 1 m; the other's half width is 1 m."""
+    forecast, batch = meet([(0.0, 0.0), (0.0, 0.0)], [(10.0, 3.0), (20.0, 3.0)], (0.0, 3.0, 10.0, 0.0))
+    batch.states[0, 0, 2:] = 0.0
+    assert not contacts(forecast, batch).by_step.any()
+    assert contacts(forecast, replace(batch, heading_rad=np.full(1, np.pi / 2))).by_step.any()

@@ -62,6 +62,30 @@ def test_the_oracle_is_what_then_happens(steps_before: int):
         np.testing.assert_allclose(env.scene.scene.states[:, :2], true[:, step], atol=1e-9)
 
 
+class Seeing(Chased):
+    """The prey's driver decides by its observation alone, as a trained one does."""
+
+    def drive_others(self, observations: Any) -> dict[str, Any]:
+        own = without_added(observations["agent_0"])
+        return {"agent_0": 1 + int(np.argmax(np.abs(own[4:8])))}
+
+
+def test_drivers_that_read_observations_see_those_of_each_step(monkeypatch: pytest.MonkeyPatch):
+    """Not those of the moment at which the futures begin."""
+    env = ForecastParallelEnv(Seeing(), "constant-velocity", horizon_steps=10, arm=Arm("oracle"))
+    seen, _ = env.reset(seed=4)
+    for _ in range(4):
+        seen, *_ = env.step(kept(env, seen, [1, 2, 4]))
+    true, decided = env.scene.true_xy, set()
+    assert true is not None
+    for step in range(10):
+        chosen = kept(env, seen, [1, 2, 4])
+        decided.add(chosen["agent_0"])
+        seen, *_ = env.step(chosen)
+        np.testing.assert_allclose(env.scene.scene.states[:, :2], true[:, step], atol=1e-9)
+    assert len(decided) > 1
+
+
 def test_before_the_first_action_all_go_on_at_their_velocities():
     """Actions of an episode before do not count."""
     env = watched_tag()

@@ -33,7 +33,7 @@ from envs.seeding import driver_rng
 from envs.wrappers import SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import load_forecaster
-from predictor.data.store import StoreInfo, write_store
+from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import Outcome
 from predictor.forecaster import Belief, Futures
@@ -400,6 +400,21 @@ def test_many_learners_have_no_known_graph_and_time_passes(tmp_path: Path):
     assert episode.edge_types == episode.edge_probs == []
     assert len(episode.latencies_s) == 7
     assert min(episode.latencies_s) > 0
+
+
+def test_the_noise_of_a_control_is_that_of_its_episode(tmp_path: Path):
+    """Else all episodes would have one noise, and an interval over them would be too narrow."""
+    made = task(driver="idle", checkpoint="constant-velocity", samples=3, horizon_steps=2)
+    recorded = Episode(
+        np.random.default_rng(0).normal(size=(8, 3, 4)), np.ones((8, 3), bool), np.arange(3), "recorded", 0
+    )  # fmt: skip
+    write_store(tmp_path / "store", StoreInfo(HighwayReader(make_env(made.env_id)).spec, made.env_id), [recorded] * 4)
+    noises = []
+    for seed in (3, 4, 3):
+        found = play(replace(made, seed=seed, stores=(str(tmp_path / "store"),))).outcomes[NOISY].forecast
+        noises.append((found - found[:, :1])[0, 1:, 1])
+    assert torch.allclose(noises[0], noises[2]) and not torch.allclose(noises[0], noises[1])
+    assert noises[0].abs().min() > 0
 
 
 def test_an_episode_is_a_function_of_its_task(tmp_path: Path):

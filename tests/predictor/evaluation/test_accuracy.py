@@ -422,4 +422,9 @@ def test_probabilities_and_scales_that_are_none_are_refused(changes: dict[str, t
 
 def test_probabilities_of_absent_agents_do_not_matter():
     probs = torch.tensor([[[0.25], [0.75]]])
-    Tally().add(replace(OUTCOMES[1], forecast=OUTCOMES[0].forecast[:, :, :1], mode_probs=0 * probs))
+    found = []
+    for shown in (0 * probs, probs):
+        tally = Tally()
+        tally.add(replace(OUTCOMES[1], forecast=OUTCOMES[0].forecast[:, :, :1], mode_probs=shown))
+        found.append(tally)
+    assert str(found[0].accuracy("x")) == str(found[1].accuracy("x"))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from predictor.support.errors import UserError
-from predictor.support.reading import MIB, parse_json, read_toml
+from predictor.support.reading import parse_json, read_toml
 from predictor.support.typed_values import converted
 
 PATIENCE_S = 20.0
@@ -26,7 +26,7 @@ def test_a_key_that_is_given_twice_is_found_in_one_pass():
 @pytest.mark.parametrize("dots", [".", " . ", "\t.  "])
 def test_names_of_many_parts_are_refused_before_they_are_read(tmp_path: Path, dots: str):
     file = tmp_path / "preset.toml"
-    parts = MIB // (len(dots) + 1) - 9
+    parts = 100_000
     for text in (
         dots.join("a" * parts) + " = 1",
         f"[{dots.join('a' * parts)}]",
