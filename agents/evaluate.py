@@ -129,8 +129,8 @@ class EvaluateConfig:
     drivers: tuple[str, ...] | None = None
     """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
     (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego. None takes constant-actions
-    where actions are discrete; `--drivers none` adds no line. The planner is no default since it takes minutes: it
-    simulates and forecasts every plan at every step."""
+    where actions are discrete; `--drivers none` adds no line beside random and idle. The planner is no default since it
+    takes minutes: it simulates and forecasts every plan at every step."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED

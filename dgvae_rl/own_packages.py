@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 OWN = ("agents", "envs", "predictor", "train_policy")
@@ -117,6 +117,13 @@ class _Alias(Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         module.__spec__ = self._spec  # the import system has replaced it by the second name's
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        """Returns the module's code, for `python -m`."""
+        found = importlib.util.find_spec(self._name)
+        loader: Any = None if found is None else found.loader
+        code: CodeType | None = None if loader is None else loader.get_code(self._name)
+        return code
 
 
 class _SecondCopy(SourceFileLoader):

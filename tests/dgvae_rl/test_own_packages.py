@@ -161,3 +161,16 @@ except ModuleNotFoundError as error:
     print(error)
 """
     assert run(code, tmp_path) == "No module named 'envs.absent'\n"
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_modules_run_by_their_path_below_the_package(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, hidden: bool
+):
+    """With folders of the user's own in the way, and without."""
+    folder = project if hidden else tmp_path_factory.mktemp("empty")
+    done = subprocess.run(
+        [sys.executable, "-m", "dgvae_rl.predictor.evaluate", "--help"],
+        cwd=folder, env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "--checkpoint" in done.stdout, done.stderr[-1000:]

@@ -751,7 +751,7 @@ def test_features_that_are_learned_keep_their_unit(tmp_path: Path):
     assert after.feature_labels == ("desired_speed_mps", "", "leader", "time_gap_s")
     assert (after.label_means[0], after.label_scales[0]) == (before.label_means[0], before.label_scales[0])
     assert before.label_means[0] < 30 and after.label_means[3] > 2
-    mute = write_followers(tmp_path / "three", speed_mps=0.0)  # drivers that yield throughout: their wish is not known
+    mute = write_followers(tmp_path / "three", speed_mps=-9.0)  # drivers that yield throughout: their wish is not known
     kept = made(config(mute, tmp_path / "third", init=str(first), **LABELS)).model.config
     assert kept.feature_labels[0] == "desired_speed_mps"
     assert (kept.label_means[0], kept.label_scales[0]) == (before.label_means[0], before.label_scales[0])
