@@ -26,7 +26,7 @@ from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
 from envs.supervision import TIMEOUT_S
 from envs.testing import store_problems
-from predictor.data.partial_store import PartialStore, beside
+from predictor.data.partial_store import PartialStore, beside, parts_of
 from predictor.data.store import Episode, StoreInfo
 from predictor.data.store_files import check_new_store
 from predictor.support.cluster import check_address
@@ -331,6 +331,13 @@ def _settings(config: CollectConfig, info: StoreInfo) -> dict[str, Any]:
     return given | made | drivers | {"content_of_env": content_of_module(config.env_id), "spec": asdict(info.spec)}
 
 
+def _kept_before(config: CollectConfig) -> str:
+    """Returns what earlier starts of a recording have kept, before it is looked at."""
+    if not parts_of(config.out).exists():
+        return "no episode is kept yet; the same command begins anew"
+    return "what an earlier start kept is still there; the same command goes on"
+
+
 def _kept(config: CollectConfig, partial: PartialStore) -> str:
     """Returns what a recording that is stopped keeps."""
     if not partial.num_done:
@@ -343,7 +350,7 @@ def main() -> None:
     """Entry point."""
     config = parse(CollectConfig, __doc__)
     check_new_store(config.out, config.overwrite)
-    with resumable("what an earlier start kept is still there; the same command goes on"), open_pool(config) as pool:
+    with resumable(lambda: _kept_before(config)), open_pool(config) as pool:
         info = _info_from(config, pool)
         with locked_path(config.out), locked_path(beside(config.out)):
             check_new_store(config.out, config.overwrite)  # another recording may have ended meanwhile

@@ -34,6 +34,12 @@ def beside(path: Path) -> Path:
     return Path(f"{path.name}-{hashlib.sha256(address(path).encode()).hexdigest()[:8]}")
 
 
+def parts_of(path: Path) -> Path:
+    """Returns the folder of the parts of a store that is being recorded."""
+    kept = beside(path)
+    return kept.with_name(f".{kept.name}.unfinished")
+
+
 class PartialStore:
     """Episodes of a store that is being recorded, in their order; a context manager, which writes what it has at exit.
 
@@ -58,7 +64,7 @@ class PartialStore:
         """Finds the parts of an earlier attempt."""
         self._path, self._part_s = Path(path), part_s
         kept = beside(self._path)
-        self.folder = kept.with_name(f".{kept.name}.unfinished")
+        self.folder = parts_of(self._path)
         self._settings = json.loads(json.dumps(settings, default=str))
         self._info: StoreInfo | None = None
         self._new: list[Episode] = []

@@ -122,6 +122,9 @@ def test_a_stop_before_the_first_new_episode_says_that_earlier_ones_are_kept(
     words = ["--env-id", TAG, "--episodes", "3", "--max-steps", "3", "--workers", "1", "--out", str(tmp_path / "store")]
     monkeypatch.setattr(collect, "_info_from", stop)
     code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
+    assert (code, errors[-1]) == (130, "stopped: no episode is kept yet; the same command begins anew")
+    (tmp_path / ".store.unfinished").mkdir()
+    code, errors, _ = run_command(collect.main, words, monkeypatch, capsys)
     assert code == 130
     assert errors[-1] == "stopped: what an earlier start kept is still there; the same command goes on"
 

@@ -330,44 +330,30 @@ def test_episodes_too_short_are_named(in_process: None):
         measure(TAG, STILL, max_steps=2, horizon_steps=3)
 
 
-def test_of_several_environments_one_that_cannot_be_measured_costs_no_other(
-    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+@pytest.mark.parametrize("fails", [UserError, EnvironmentFailedError])
+def test_of_several_environments_one_that_fails_costs_no_other(
+    fails: type[Exception], in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ):
+    """One that cannot be measured, and one that breaks, after which the command ends."""
     words = ["--env-ids", TAG, ROAD, "--checkpoint", STILL, "--episodes", "1", "--max-steps", "6", "--num-samples", "2"]
     words += ["--workers", "1", "--out", str(tmp_path)]
     played = evaluate.evaluate_env
 
     def fail_on_the_road(config: Any, env_id: str, checkpoint: str) -> Any:
         if env_id == ROAD:
-            raise UserError(f"{ROAD}: no forecast")
+            raise fails(f"{ROAD}: no forecast")
         return played(config, env_id, checkpoint)
 
     monkeypatch.setattr(evaluate, "evaluate_env", fail_on_the_road)
     code, errors, _ = run_command(evaluate.main, words, monkeypatch, capsys)
-    assert (code, errors) == (2, [f"error: not measured: {ROAD}: no forecast; all else is in {tmp_path}"])
-    written = json.loads((tmp_path / "accuracy.json").read_text())
-    assert [result["env_id"] for result in written["results"]] == [TAG]
-    assert written["misfits"] == [{"env_id": ROAD, "checkpoint": STILL, "why": f"{ROAD}: no forecast"}]
-
-
-def test_what_is_measured_stays_when_a_later_environment_fails(
-    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-):
-    words = ["--env-ids", TAG, ROAD, "--checkpoint", STILL, "--episodes", "1", "--max-steps", "6", "--num-samples", "2"]
-    words += ["--workers", "1", "--out", str(tmp_path)]
-    played = evaluate.evaluate_env
-
-    def fail_on_the_road(config: Any, env_id: str, checkpoint: str) -> Any:
-        if env_id == ROAD:
-            raise EnvironmentFailedError(f"{ROAD}, seed 3, step 2: RuntimeError: engine")
-        return played(config, env_id, checkpoint)
-
-    monkeypatch.setattr(evaluate, "evaluate_env", fail_on_the_road)
-    code, errors, _ = run_command(evaluate.main, words, monkeypatch, capsys)
-    assert code != 0 and "engine" in errors[-1]
     written = json.loads((tmp_path / "accuracy.json").read_text())
     assert [result["env_id"] for result in written["results"]] == [TAG]
     assert TAG in (tmp_path / "accuracy.md").read_text()
+    if fails is UserError:
+        assert (code, errors) == (2, [f"error: not measured: {ROAD}: no forecast; all else is in {tmp_path}"])
+        assert written["misfits"] == [{"env_id": ROAD, "checkpoint": STILL, "why": f"{ROAD}: no forecast"}]
+    else:
+        assert code != 0 and "no forecast" in errors[-1] and written["misfits"] == []
 
 
 def test_all_stores_are_looked_for_before_anything_is_played(
