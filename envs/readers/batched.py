@@ -172,9 +172,7 @@ def _as_scenes(given: AgentTensors, envs: int) -> SceneBatch:
         raise UserError(f"TensorReader needs ids that are whole numbers, got {ids.dtype}")
     states = np.where(valid[..., None], states, 0.0).astype(np.float64, copy=False)
     ids = np.where(valid, ids, PADDING_ID).astype(np.int64, copy=False)
-    heading_rad = np.array(
-        heading_rad, dtype=np.float64
-    )  # a copy, as the others are: the simulator may write into its own
+    heading_rad = np.array(heading_rad, dtype=np.float64)  # the simulator may write into its own
     return SceneBatch(states, ids, valid, heading_rad)
 
 
