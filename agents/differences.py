@@ -17,8 +17,8 @@ DRAWS = 10_000
 def reference_policy(results: Mapping[str, Sequence[EpisodeResult]]) -> str | None:
     """Returns the policy that the others are compared with: the constant action of the highest mean return.
 
-    A constant action is a driver that is named after the only action that it took, or the idle driver. Without one, the
-    reference is the first policy; None without any.
+    A constant action is a driver that is named after the only action that it took, or the idle driver where actions are
+    discrete. Without one, the reference is the first policy; None without any.
     """
     constant = [name for name, episodes in results.items() if _takes_one_action(name, episodes)]
     if not constant:

@@ -12,6 +12,7 @@ is always present, so an empty scene works. It is not recurrent: only the foreca
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -82,6 +83,21 @@ class AttentionConfig:
             raise UserError(f"scales must be positive, got {', '.join(map(str, scales))}")
 
 
+def agents_there(valid: Float[Tensor, "batch agents"]) -> Bool[Tensor, "batch agents"]:
+    """Returns which agents the entry `valid` says are there.
+
+    Raises:
+        UserError: it is neither 0 nor 1: a wrapper has scaled it, and agents would seem absent.
+    """
+    there = valid > 0.5
+    if bool((there != valid).any()):
+        raise UserError(
+            "the entry valid must be 0 or 1: a wrapper has changed it; with VecNormalize, pass "
+            "norm_obs_keys=['observation']"
+        )
+    return there
+
+
 class ForecastAttention(BaseFeaturesExtractor):
     """SB3 features extractor for observations with forecasts; works with any subset of the token keys.
 
@@ -104,7 +120,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         """Makes the layers in the sizes of the space.
 
         Raises:
-            UserError: the space is not a Dict, or has no key of the environment's own.
+            UserError: the space is not a Dict, has no key of the environment's own, or entries of other shapes.
         """
         config = config or AttentionConfig()
         own = own_part(observation_space) if isinstance(observation_space, gym.spaces.Dict) else {}
@@ -117,6 +133,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         super().__init__(observation_space, features_dim=ego_dim + config.width)
         self.config = config
         shapes = {k: space.shape or () for k, space in observation_space.items()}
+        _check_shapes(shapes)
         self._own = tuple(own)
         self._keys = tuple(k for k in TOKEN_KEYS if k in shapes)
         self.ego = nn.Sequential(
@@ -170,7 +187,7 @@ class ForecastAttention(BaseFeaturesExtractor):
 
     def _valid(self, observations: dict[str, Tensor]) -> Bool[Tensor, "batch agents"]:
         if VALID_KEY in observations:
-            return observations[VALID_KEY] > 0.5
+            return agents_there(observations[VALID_KEY])
         agents = observations[self._keys[0]]
         return torch.ones(agents.shape[:2], dtype=torch.bool, device=agents.device)
 
@@ -237,3 +254,15 @@ class ForecastAttention(BaseFeaturesExtractor):
         weights = logits.masked_fill(absent[..., None], -torch.inf).softmax(dim=1)
         attended = weights.transpose(1, 2) @ seen
         return torch.einsum("bhw,hdw->bhd", attended, value).flatten(1) + self.value.bias
+
+
+def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raises a `UserError` where a wrapper has stacked or reshaped the entries."""
+    plane = [key for key in ("forecast", EGO_PATH) if key in shapes and shapes[key][-1] != 2]
+    slots = {shapes[key][0] for key in (*TOKEN_KEYS, VALID_KEY) if key in shapes}
+    if plane or len(slots) > 1:
+        raise UserError(
+            "ForecastAttention needs the entries as the wrapper gives them, got "
+            f"{', '.join(f'{key} {shape}' for key, shape in shapes.items())}; leave out what stacks or reshapes them "
+            "(VecFrameStack): the forecaster keeps the history"
+        )

@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.dqn.policies import MultiInputPolicy, QNetwork
 from torch import Tensor, nn
 
-from agents.features import VALID_KEY, WHAT_IF_GAP, AttentionConfig, ForecastAttention
+from agents.features import VALID_KEY, WHAT_IF_GAP, AttentionConfig, ForecastAttention, agents_there
 from agents.task import Task
 from envs.plans import plan_model_for
 from predictor.support.errors import UserError
@@ -85,7 +85,7 @@ class PlanAttention(ForecastAttention):
 
         Absent agents count as far away.
         """
-        absent = (observations[VALID_KEY] < 0.5)[..., None]
+        absent = ~agents_there(observations[VALID_KEY])[..., None]
         gap = observations[WHAT_IF_GAP].masked_fill(absent, 2 * self.config.far_m).amin(1)
         contact = observations[CONTACT].masked_fill(absent, 1.0).amin(1)
         risk = observations[RISK]

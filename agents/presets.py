@@ -23,6 +23,9 @@ _COUNTS = (
 _AMOUNTS = ("learning_starts", "ent_coef", "top_quantiles_to_drop_per_net", "gamma", "gae_lambda", "vf_coef")
 _POSITIVE = ("learning_rate", "tau", "exploration_fraction", "target_kl")
 _WIDTHS = ("net_arch", "lstm_hidden_size", "n_quantiles")
+_LAYERS = ("n_critics", "n_lstm_layers")
+MOST_LAYERS = 1_000
+"""Largest number of networks, and of layers, beside each other or one behind the other."""
 _KEPT = ("n_steps", "buffer_size", "batch_size")
 STEP_BYTES = 32
 """Least memory of a step that is kept: an observation of one number, action, reward, value and end."""
@@ -53,6 +56,7 @@ class Preset:
         check_at_least(self, 0, *(name for name in _AMOUNTS if name in names and not isinstance(names[name], str)))
         check_positive(self, *(name for name in _POSITIVE if name in names))
         check_at_most(self, MOST_WIDTH, *(name for name in _WIDTHS if name in names))
+        check_at_most(self, MOST_LAYERS, *(name for name in _LAYERS if name in names))
         for name in _KEPT:
             kept = names.get(name, 0)
             check_memory(kept * STEP_BYTES, f"{name}={kept:,}", f"choose a smaller {name}")

@@ -31,9 +31,10 @@ class WatchConfig:
     """Films an episode of a trained policy, or plays it in a window."""
 
     policy: Positional[Path]
-    """Run folder of train_policy.py, a policy's .zip, or hub:owner/name with --trust-pickle."""
+    """Run folder of train_policy.py, a policy's .zip, one that ships (highway-fast), or hub:owner/name with
+    --trust-pickle."""
     out: Path | None = None
-    """Film to write, .mp4; None takes watch-SEED.mp4 beside the policy, or here for one of a hub."""
+    """Film to write, .mp4; None takes watch-SEED.mp4 beside the policy, or here for one that ships or is of a hub."""
     seed: int = EVALUATION_SEED
     """Random seed of the episode; the default is the first one of an evaluation."""
     window: bool = False

@@ -34,6 +34,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, scratch_folder, write_json, write_text
+from predictor.support.memory import check_count
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device
@@ -76,6 +77,8 @@ class InterpretConfig:
         """
         check_at_least(self, 1, "max_windows", "burn_in_steps", "horizon_steps", "num_samples")
         check_at_least(self, 0, "seed")
+        check_count(self.num_samples, "num_samples")
+        check_count(self.num_samples * self.horizon_steps, "horizon_steps times num_samples")
         object.__setattr__(self, "device", resolve_device(self.device))
 
 

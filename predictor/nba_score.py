@@ -22,6 +22,7 @@ from predictor.data.store import read_store
 from predictor.data.windows import Windows
 from predictor.evaluation import nba_protocol
 from predictor.evaluation.nba_protocol import (
+    HORIZON_STEPS,
     NUM_SAMPLES,
     PUBLISHED,
     TEST_FORECASTS,
@@ -39,6 +40,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, write_json, write_text
+from predictor.support.memory import ITEM_BYTES, check_count
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device, tune
 
@@ -93,6 +95,8 @@ class NbaScoreConfig:
             UserError: a value out of range, noise where a single sample has none, or a device that is not there.
         """
         check_at_least(self, 1, "num_samples", "batch_size")
+        check_count(self.num_samples, "num_samples", ITEM_BYTES * HORIZON_STEPS)
+        check_count(self.batch_size, "batch_size")
         check_at_least(self, 0, "max_windows", "seed")
         if self.train_data is not None and self.num_samples == 1:
             raise UserError(

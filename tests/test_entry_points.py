@@ -44,6 +44,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint highway --data absent", "no episode store at absent"),
         ("--checkpoint highway --data absent --out file", "file is a file; choose another --out"),
         ("--checkpoint highway --data absent --num-samples 0", "num_samples must be at least 1, got 0"),
+        ("--checkpoint highway --data absent --num-samples 1000000000000", "num_samples=1,000,000,000,000 needs"),
         ("--checkpoint highway --data absent --seed -1", "seed must not be negative, got -1"),
         ("--checkpoint highway --data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
@@ -68,6 +69,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--data absent --checkpoint absent", "no checkpoint 'absent'"),
         ("--data absent --out file", "file is a file; choose another --out"),
         ("--data absent --num-samples 0", "num_samples must be at least 1, got 0"),
+        ("--data absent --num-samples 1000000000000", "num_samples=1,000,000,000,000 needs"),
+        ("--data absent --batch-size 1000000000000", "batch_size=1,000,000,000,000 needs"),
         ("--data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "docs.draw_pictures": [

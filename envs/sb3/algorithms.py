@@ -71,7 +71,10 @@ def algorithm_of_parameters(parameters: Mapping[str, Any]) -> Algorithm | None:
     if _FOREIGN & parameters.keys():
         return None
     found = next((name for mark, name in _MARKS.items() if mark in parameters), None)
-    if found == "ppo" and ".recurrent." in str(_policy_module(parameters)):
+    module = str(_policy_module(parameters))
+    if found == "ppo" and (".maskable." in module or ".ppo_mask." in module):
+        return None
+    if found == "ppo" and ".recurrent." in module:
         return "recurrent-ppo"
     return found
 

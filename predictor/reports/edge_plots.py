@@ -175,7 +175,7 @@ def graphs_figure(
         axes[0, column].set_title(f"{_percentile(column)} window: {window.place}\ntruth", fontsize=10)
         what = "pairs" if symmetric else "ordered pairs"
         axes[1, column].set_title(
-            f"inferred: edge or none right for {right} of {all_pairs} {what} ({right / all_pairs:.2f})", fontsize=10
+            f"inferred: edge or none right for\n{right} of {all_pairs} {what} ({right / all_pairs:.2f})", fontsize=10
         )
         for ax in axes[:, column]:
             _frame(ax, on_circle)

@@ -1,15 +1,20 @@
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from agents.features import EGO_PATH, TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAttention
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
+from envs import SceneObservation, VecForecast
 from envs.entries import FORECAST_KEYS, PATH_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -327,3 +332,26 @@ def test_heads_must_divide_width():
 def test_scales_must_be_positive(scale: str, value: float):
     with pytest.raises(UserError, match="scales must be positive, got "):
         AttentionConfig(**{scale: value})
+
+
+def vector(outer: Callable[[Any], Any]) -> Any:
+    """Returns two highways with forecasts, in a wrapper of Stable-Baselines3."""
+    inner = make_vec_env("highway-fast-v0", 2, seed=0, wrapper_class=SceneObservation)
+    return outer(VecForecast(inner, "constant-velocity"))
+
+
+def ppo(venv: Any) -> PPO:
+    kwargs = {"features_extractor_class": ForecastAttention, "net_arch": [4]}
+    return PPO("MultiInputPolicy", venv, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=kwargs)
+
+
+def test_agents_that_a_wrapper_has_scaled_away_are_named():
+    """VecNormalize makes an entry that is always 1 a 0: the network saw no agent, and nothing was said."""
+    with pytest.raises(UserError, match=r"valid must be 0 or 1: .*with VecNormalize, pass norm_obs_keys"):
+        ppo(vector(VecNormalize)).learn(32)
+    ppo(vector(lambda venv: VecNormalize(venv, norm_obs_keys=["observation"]))).learn(16)
+
+
+def test_entries_that_a_wrapper_has_stacked_are_named():
+    with pytest.raises(UserError, match=r"entries as the wrapper gives them, .*leave out what stacks .*VecFrameStack"):
+        ppo(vector(lambda venv: VecFrameStack(venv, 2)))

@@ -85,3 +85,23 @@ def test_without_prey_nothing_is_added():
     _, rewards, *_ = env.step({agent: 1 for agent in env.agents})
     assert len(rewards) == 2
     env.close()
+
+
+def test_of_several_prey_the_nearest_one_counts():
+    envs: list[Any] = [wrap(make_multiagent_env(TAG, num_good=2)) for wrap in (Chase, lambda env: env)]
+    for env in envs:
+        env.reset(seed=4)
+
+    def nearest_m() -> dict[str, float]:
+        bodies = envs[0].unwrapped.world.agents
+        prey = [body.state.p_pos for body in bodies if not body.adversary]
+        return {b.name: min(np.linalg.norm(p - b.state.p_pos) for p in prey) for b in bodies if b.adversary}
+
+    rng, first = np.random.default_rng(0), nearest_m()
+    gained = dict.fromkeys(PREDATORS, 0.0)
+    while envs[0].agents:
+        actions = {name: int(rng.integers(5)) for name in envs[0].agents}
+        shaped, plain = (env.step(actions)[1] for env in envs)
+        for name in PREDATORS:
+            gained[name] += shaped[name] - plain[name]
+    assert gained == pytest.approx({name: PER_METRE * (first[name] - last) for name, last in nearest_m().items()})

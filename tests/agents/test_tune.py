@@ -7,6 +7,7 @@ import sys
 import tomllib
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import optuna
@@ -298,3 +299,14 @@ def test_any_folder_may_hold_a_tuning(tmp_path: Path):
     folder.mkdir()
     open_study(folder / "tuning.db")
     assert [path.name for path in folder.iterdir()] == ["tuning.db"]
+
+
+def test_of_equal_trials_the_first_one_is_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings = [{"learning_rate": rate} for rate in (1e-4, 2e-4, 3e-4)]
+    values = (1.0, 2.0, 2.0)
+    trials = [SimpleNamespace(value=v, user_attrs={"settings": s}) for v, s in zip(values, settings, strict=True)]
+    monkeypatch.setattr(command, "_ended", lambda study: trials)
+    (tmp_path / "tuned").mkdir()
+    command._write_best(config(tmp_path / "tuned"), None, PPOPreset())  # type: ignore[arg-type]
+    text = (tmp_path / "tuned" / command.BEST_FILE).read_text()
+    assert "trial 2, the best of 3" in text and "0.0002" in text

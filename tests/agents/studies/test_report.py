@@ -283,3 +283,13 @@ def test_the_time_of_a_test_step_is_that_of_all_steps_of_an_arm(tmp_path: Path):
     text = (tmp_path / "report.md").read_text().split("## Time")[1]
     [line] = [line for line in text.splitlines() if line.startswith("| forecast |")]
     assert line.split("|")[-2].strip() == "600.0"
+
+
+def test_no_share_is_told_of_a_headroom_whose_interval_reaches_zero():
+    """The oracle's mean is two above that of zeros, and its runs lie three apart."""
+    found = [r for r in results() if r.arm != "oracle"]
+    found += [result("oracle", [4 + d, 4 + d], seed) for seed, d in enumerate((-3.0, 0.0, 3.0))]
+    findings = found_in(study(), found)
+    headroom = findings.headroom("one", "ppo")
+    assert headroom is not None and headroom.value == pytest.approx(2.0) and headroom.low < 0
+    assert findings.headroom_used("one", SEEN) is None

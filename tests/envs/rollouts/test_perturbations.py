@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from envs.rollouts.interventions import interventions_of
-from envs.rollouts.perturbations import ON_ROADS, Perturber, check_kinds
+from envs.rollouts.perturbations import ON_ROADS, SHARES, Perturber, check_kinds
 from envs.rollouts.world import open_world
 from envs.seeding import branch_rng, driver_rng, label_rng, perturbation_rng, plan_rng, reaction_rng
+from envs.simulators.intervention import Intervention
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played
 
@@ -87,3 +88,15 @@ def test_kinds_that_are_not_possible_are_named():
     assert check_kinds(world, ("brake",)) == ("brake",)
     with pytest.raises(UserError, match="perturb_kinds must be among brake, accelerate, remove in this environment"):
         check_kinds(world, ("left",))
+
+
+def test_kinds_come_in_their_shares(monkeypatch: pytest.MonkeyPatch):
+    begun: list[Intervention] = []
+    monkeypatch.setattr("envs.rollouts.perturbations.intervene", lambda world, one: begun.append(one))
+    world = open_world("highway-fast-v0", "idle")
+    world.reset(0)
+    perturber = Perturber(world, 1.0, (), perturbation_rng(0))
+    for _ in range(1000):  # nothing acts, so that each call begins one
+        perturber()
+    counts = Counter(one.kind for one in begun)
+    assert {kind: counts[kind] / 1000 for kind in SHARES} == pytest.approx(SHARES, abs=0.05)

@@ -9,7 +9,7 @@ import gymnasium as gym
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
+from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 from envs.drivers.trained import env_for_driver
@@ -49,6 +49,7 @@ def saved(folder: Path, algorithm: str) -> Path:
         "tqc": lambda: TQC("MlpPolicy", steered, buffer_size=10, **TINY),
         "td3": lambda: TD3("MlpPolicy", steered, buffer_size=10, **TINY),
         "trpo": lambda: TRPO("MlpPolicy", env, n_steps=4, batch_size=4, **TINY),
+        "maskable-ppo": lambda: MaskablePPO("MlpPolicy", env, n_steps=4, batch_size=4, **TINY),
         "crossq": lambda: CrossQ("MlpPolicy", steered, buffer_size=10, **TINY),
     }[algorithm]()
     model.save(folder / "policy.zip")
@@ -178,7 +179,7 @@ def test_the_note_names_the_algorithm(tmp_path: Path):
     assert read_note(path) == {"steps": 3}
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "trpo", "crossq"])
+@pytest.mark.parametrize("algorithm", ["td3", "trpo", "crossq", "maskable-ppo"])
 def test_other_algorithms_are_refused(algorithm: str, tmp_path: Path):
     with pytest.raises(UserError, match=f"policy.zip holds no policy of {', '.join(ALGORITHMS)}$"):
         load_policy(saved(tmp_path, algorithm))

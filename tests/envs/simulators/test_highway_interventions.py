@@ -237,3 +237,23 @@ def test_a_reset_drops_interventions():
     world.reset(3)
     assert interventions_of(world) == {}
     assert_same_scenes(played(world, 3), expected)
+
+
+@pytest.mark.parametrize(
+    ("place_m", "speed_mps", "returns"), [(-22.0, 30.0, False), (22.0, 30.0, True), (-22.0, 15.0, True)]
+)
+def test_who_drives_behind_decides_how_much_room_a_vehicle_needs_to_come_back(
+    place_m: float, speed_mps: float, returns: bool
+):
+    """10 m and half a second of the one behind: 25 m in front of 30 m/s, 20 m where 20 m/s follows."""
+    world = road_world(*CARS)
+    intervene(world, Intervention(2, "remove", 1))
+    other = world.env.unwrapped.road.vehicles[1]
+    played(world, 1)
+    absent = world.env.unwrapped.road.act.running[0].vehicle
+    for vehicle in world.env.unwrapped.road.vehicles:
+        if vehicle is not other:
+            vehicle.position = vehicle.position + np.array([500.0, 0.0])
+    absent.speed = 20.0
+    other.position, other.speed = absent.position + np.array([place_m, 0.0]), speed_mps
+    assert (2 not in interventions_of(world)) == returns

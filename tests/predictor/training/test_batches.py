@@ -363,3 +363,10 @@ def test_on_a_cpu_batches_are_cut_by_it():
         source = open_batches(replace(CONFIG, data_device=asked), windows(), CPU)  # type: ignore[arg-type]
         assert type(source.batches) is kind and source.batches.shapes is None  # type: ignore[attr-defined]
         assert (source.capture, source.notes) == (False, ())
+
+
+def test_the_rate_falls_without_a_jump_to_the_last_step():
+    rates = [plan(replace(CONFIG, steps=1000, lr=2.0), [5], step).lr for step in range(1000)]
+    assert rates[100] == pytest.approx(2.0, rel=1e-3)  # the fall begins where the warm-up ends
+    assert rates[550] == pytest.approx(2.0 * (0.02 + 0.98 / 2))  # half-way
+    assert rates[-2] > rates[-1] > 0.04

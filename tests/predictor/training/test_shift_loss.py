@@ -91,3 +91,24 @@ def test_both_windows_of_a_pair_have_equal_noise(tmp_path: Path):
     assert shifts is not None
     network = DGVAE(spec(has_ego=True), PLURAL, 2).train()
     assert shifts.loss(network, 0, 2, SCALES, num_modes=2).item() == 0
+
+
+def test_each_step_and_seed_draws_its_own_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    episodes = [episode for seed in range(8) for episode in twins_of(seed, 3.0)]
+    draw, drawn = Twins.draw, list[np.ndarray]()
+
+    def watched(twins: Twins, count: int, rng: np.random.Generator) -> np.ndarray:
+        drawn.append(draw(twins, count, rng))
+        return drawn[-1]
+
+    monkeypatch.setattr(Twins, "draw", watched)
+    network = DGVAE(spec(has_ego=True), PLURAL, 2)
+    settings = TrainConfig(
+        (tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY, batch_size=16
+    )
+    for seed, step in ((0, 0), (0, 1), (0, 0), (1, 0)):
+        shifts = Shifts.of(replace(settings, seed=seed), episodes, spec(has_ego=True), several_processes=False)
+        assert shifts is not None
+        shifts.loss(network, step, 2, SCALES)
+    first, later, again, other = (pairs.tolist() for pairs in drawn)
+    assert first == again and first != later and first != other

@@ -855,3 +855,19 @@ def test_new_networks_see_changes_of_place(frame: Any, expected: bool, tmp_path:
     old = train(replace(settings, set=("changes_of_place=false",)))
     begun = made(config(tmp_path / "street", tmp_path / "next", init=str(old)))
     assert begun.model.config.changes_of_place is False
+
+
+def test_a_validation_draws_its_windows_from_all_held_out_episodes(circles: Path, tmp_path: Path):
+    few = {"val_fraction": 0.5, "val_windows": 12}
+    [(windows, drawn)] = made(config(circles, tmp_path / "run", **few))._val_indices()
+    [(_, again)] = made(config(circles, tmp_path / "run", **few))._val_indices()
+    assert len(set(drawn.tolist())) == 12 < len(windows) and drawn.tolist() == again.tolist()
+    assert set(windows.index[drawn, 0]) == set(windows.index[:, 0])
+
+
+def test_weights_whose_score_is_not_finite_do_not_replace_the_last_ones(
+    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Trainer, "score", lambda trainer, accuracy: 1.0 if trainer.step == 2 else float("nan"))
+    train(config(circles, tmp_path / "run", keep="last", steps=6, eval_every=2))
+    assert load_checkpoint(tmp_path / "run")[1].provenance["result"]["step"] == 2
