@@ -63,6 +63,11 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint highway --data absent --out file", "file is a file; choose another --out"),
         ("--checkpoint highway --data absent --out new --burn-in-steps 0", "burn_in_steps must be at least 1, got 0"),
         ("--checkpoint highway --data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+        ("--checkpoint highway --data a --out new --num-samples 1000000000000", "num_samples=1,000,000,000,000 needs"),
+        (
+            "--checkpoint highway --data a --out new --num-samples 1000000 --horizon-steps 100000000",
+            "horizon_steps times num_samples=100,000,000,000,000 needs",
+        ),
     ],
     "predictor.nba_score": [
         ("--data absent", "no episode store at absent"),
