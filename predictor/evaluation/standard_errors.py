@@ -1,9 +1,10 @@
 """Computes mean and standard error over random subsets of a test set (paper Sec. V: "across 20 test subsets").
 
-The windows are divided at random into subsets of (almost) equal size, the metric is computed on each, and the standard
-error is the subsets' standard deviation (n − 1) over √subsets. Equal seeds and numbers of windows give equal subsets,
-so all lines of a table are compared on equal subsets. The error measures the dependence on the choice of test windows,
-not on the seed of training; it is too small if windows overlap in time, since they are not independent.
+Episodes (windows, where these are not known) are divided at random into subsets of (almost) equal size, the metric is
+computed on each, and the standard error is the subsets' standard deviation (n − 1) over √subsets. Equal seeds and
+numbers of episodes give equal subsets, so all lines of a table are compared on equal subsets. The error measures the
+dependence on the choice of test episodes, not on the seed of training; it is too small where only windows are known and
+overlap in time, since they are not independent.
 """
 
 from collections.abc import Callable
