@@ -15,7 +15,6 @@ from typing import Any
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
@@ -86,11 +85,6 @@ class Timed:
         setattr(owner, method, timed)
 
 
-class _Quiet(BaseCallback):
-    def _on_step(self) -> bool:
-        return True
-
-
 def make(task: Task, num_envs: int, seed: int) -> BaseAlgorithm:
     """Makes a model with its environments, as train_policy.py does."""
     return make_model(TrainingPlan(task, "ppo", 1_000_000, num_envs, seed), make_venv(task, num_envs))
@@ -99,7 +93,7 @@ def make(task: Task, num_envs: int, seed: int) -> BaseAlgorithm:
 def run_block(model: BaseAlgorithm, steps: int) -> float:
     """Measures environment steps per second over whole rollouts and updates."""
     before, began = model.num_timesteps, time.perf_counter()
-    model.learn(steps, callback=_Quiet(), reset_num_timesteps=False)
+    model.learn(steps, reset_num_timesteps=False)
     return (model.num_timesteps - before) / (time.perf_counter() - began)
 
 

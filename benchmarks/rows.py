@@ -14,6 +14,7 @@ from benchmarks.many_agents import exponent
 from benchmarks.row_costs import Measured, Simulator, make_run
 from benchmarks.worker_process import WorkerProcess
 from predictor.online import MAX_ROWS
+from predictor.support import markdown
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
@@ -77,14 +78,19 @@ def exponents(measured: Sequence[Measured]) -> dict[str, float]:
 
 def table(measured: Sequence[Measured]) -> str:
     """Returns the measurements as a Markdown table."""
-    lines = ["| rows | steps/s | forecasts [ms] | ms per row | simulator [ms] | peak memory [MiB] |", "|---:" * 6 + "|"]
-    for one in measured:
-        peak = "–" if one.peak_mib is None else f"{one.peak_mib:,.0f}"
-        lines.append(
-            f"| {one.rows:,} | {one.steps_per_s:,.0f} | {one.forecast_ms:,.1f} | {one.forecast_ms / one.rows:.3f} "
-            f"| {one.simulator_ms:,.1f} | {peak} |"
+    headings = ("rows", "steps/s", "forecasts [ms]", "ms per row", "simulator [ms]", "peak memory [MiB]")
+    lines = [
+        (
+            f"{one.rows:,}",
+            f"{one.steps_per_s:,.0f}",
+            f"{one.forecast_ms:,.1f}",
+            f"{one.forecast_ms / one.rows:.3f}",
+            f"{one.simulator_ms:,.1f}",
+            "–" if one.peak_mib is None else f"{one.peak_mib:,.0f}",
         )
-    return "\n".join(lines)
+        for one in measured
+    ]
+    return markdown.table(headings, lines, "r")
 
 
 def main() -> None:

@@ -356,7 +356,7 @@ def _measure_all(
         if config.out is None:
             continue
         reports.write_picture(config.out, results[-1])
-        content = {"config": asdict(config), "results": [reports.as_json(result) for result in results]}
+        content = {"config": asdict(config), "results": [asdict(result) for result in results]}
         write_json(config.out / f"{name}.json", finite(content | {"provenance": provenance(PACKAGES)}))
         write_text(config.out / f"{name}.md", reports.markdown(results))
 

@@ -72,13 +72,6 @@ def _run(check: Callable[[Trial], Iterator[str]], trial: Trial) -> list[str]:
 # --- Layout -----------------------------------------------------------------------------------------------------------
 
 
-def _sizes(trial: Trial) -> Iterator[str]:
-    for name, least in (("horizon_steps", 1), ("num_edge_types", 1), ("edge_feature_dim", 0)):
-        value = getattr(trial.forecaster, name)
-        if not isinstance(value, int | np.integer) or value < least:
-            yield f"{name} must be a whole number of at least {least}, got {value!r}"
-
-
 def _empty_memory(trial: Trial) -> Iterator[str]:
     memory: Any = trial.forecaster.empty_memory(SCENES, AGENTS)
     if not isinstance(memory, Memory):
@@ -356,7 +349,7 @@ def _plans(trial: Trial) -> Iterator[str]:
         yield "rollout_plans: others react to a plan too early; their step i may depend on its steps before i alone"
 
 
-_LAYOUT = (_sizes, _empty_memory, _observe, _rollout)
+_LAYOUT = (_empty_memory, _observe, _rollout)
 _MEANING = (
     _first_step, _arguments_stay, _repeats, _no_peeking, _window_does_not_peek, _scenes_are_independent,
     _order_of_agents, _absent_agents, _noise, _place_does_not_matter, _plans,

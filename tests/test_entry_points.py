@@ -277,7 +277,6 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "benchmarks.cluster": [("--episodes 1", "episodes must be at least 2, got 1"), ("--out .", FOLDER)],
-    "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
     "benchmarks.graph_accuracy": [
         ("--checkpoint absent --data absent", "no episode store at absent"),
         ("--checkpoint absent --data absent --neighbours 0", "neighbours must be at least 1, got (0,)"),

@@ -1,13 +1,10 @@
 """Runs cells side by side, each in a process of its own, in a folder that one study uses at a time."""
 
 import contextlib
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm  # type: ignore[import-untyped]
 
 from agents.studies.cells import Cell, run_cell
 from agents.studies.results import RESULT_FILE
@@ -69,7 +66,6 @@ class _Task:
     def run(self) -> None:
         """Runs the cell."""
         keep_freed_memory()
-        tqdm.set_lock(threading.RLock())  # a progress bar's own lock is a semaphore, which a stopped process would leak
         run_cell(self.cell, self.folder, self.commit)
 
     def waits_for(self, other: Any) -> bool:

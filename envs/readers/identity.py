@@ -193,46 +193,11 @@ def best_pairs(
     near = cost[rows, columns] < gate
     if _distinct(rows[near], cost.shape[0]):
         return rows[near], columns[near]
-    clipped = np.minimum(cost, gate)  # a pair at the gate gains nothing
-    if cost.shape[0] <= cost.shape[1]:
-        rows, columns = np.arange(cost.shape[0]), assign(clipped)
-    else:
-        rows, columns = assign(clipped.T), np.arange(cost.shape[1])
+    from scipy.optimize import linear_sum_assignment  # slow to import, and seldom needed
+
+    rows, columns = linear_sum_assignment(np.minimum(cost, gate))  # a pair at the gate gains nothing
     near = cost[rows, columns] < gate
     return rows[near], columns[near]
-
-
-def assign(cost: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, " rows"]:
-    """Returns a column for each row, no column twice, with the least sum of costs (shortest augmenting paths).
-
-    Args:
-        cost: finite; at least as many columns as rows.
-    """
-    count, width = cost.shape
-    row_price, column_price = np.zeros(count), np.zeros(width)
-    owner = np.full(width, -1)
-    for start in range(count):
-        reach, through = np.full(width, np.inf), np.full(width, -1)
-        settled = np.zeros(width, dtype=np.bool_)
-        row, column, length = start, -1, 0.0
-        while row >= 0:
-            offer = length + cost[row] - row_price[row] - column_price
-            better = ~settled & (offer < reach)
-            reach[better], through[better] = offer[better], column
-            column = int(np.where(settled, np.inf, reach).argmin())
-            settled[column], length = True, float(reach[column])
-            row = int(owner[column])
-        row_price[owner[settled & (owner >= 0)]] += length - reach[settled & (owner >= 0)]
-        row_price[start] += length
-        column_price[settled] -= length - reach[settled]
-        while column >= 0:  # back along the path, each row takes the column that was found from it
-            before = int(through[column])
-            owner[column] = start if before < 0 else owner[before]
-            column = before
-    held = np.flatnonzero(owner >= 0)
-    columns = np.empty(count, dtype=np.int64)
-    columns[owner[held]] = held
-    return columns
 
 
 def _distinct(values: np.ndarray, limit: int) -> bool:

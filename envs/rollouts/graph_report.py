@@ -1,9 +1,7 @@
 """Reports of `envs.evaluate --graph`: a table for a terminal and a page, precision against recall, calibration."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from matplotlib import pyplot as plt
@@ -97,11 +95,6 @@ def _lines(scores: Mapping[str, CausalScores]) -> list[list[str]]:
 
 def _value(estimate: Estimate | None) -> str:
     return "–" if estimate is None else f"{estimate.value:.2f}"
-
-
-def as_json(result: EnvGraph) -> dict[str, Any]:
-    """Returns one environment's results for `graph.json`."""
-    return asdict(result)
 
 
 @matplotlib.rc_context(STYLE)

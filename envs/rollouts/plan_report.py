@@ -1,9 +1,7 @@
 """Reports of `envs.evaluate --plans`: a table for a terminal and a page, and a figure of the errors and choices."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -85,11 +83,6 @@ def _plain(estimate: Estimate | None) -> str:
     if estimate is None or estimate.interval is None:
         return "–" if estimate is None else f"{estimate.value:.3f}"
     return f"{estimate.value:.3f} ({estimate.interval[0]:.3f} to {estimate.interval[1]:.3f})"
-
-
-def as_json(result: EnvPlans) -> dict[str, Any]:
-    """Returns one environment's results for `plans.json`."""
-    return asdict(result)
 
 
 @matplotlib.rc_context(STYLE)

@@ -1,7 +1,6 @@
 """Reports of `envs.evaluate --reactions`: a table for a terminal and a page, a figure by time ahead."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,16 +82,6 @@ def _lines(result: EnvReactions) -> list[list[str]]:
 def _on_path(cell: CellReactions, forecaster: str) -> str:
     found = cell.on_path.get(forecaster)
     return "–" if found is None else f"{with_interval(found.slope)} ({found.pairs})"
-
-
-def as_json(result: EnvReactions) -> dict[str, Any]:
-    """Returns one environment's results for `reactions.json`: arrays become lists."""
-    ones = [
-        asdict(one)
-        | {"true_m": one.true_m.tolist(), "predicted_m": {name: m.tolist() for name, m in one.predicted_m.items()}}
-        for one in result.perturbations
-    ]
-    return asdict(replace(result, perturbations=[])) | {"perturbations": ones}
 
 
 @matplotlib.rc_context(STYLE)

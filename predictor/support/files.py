@@ -127,7 +127,9 @@ def plain(value: Any) -> Any:
 
 
 def finite(content: Any) -> Any:
-    """Returns the content with None in place of NaN and infinity, which JSON does not have."""
+    """Returns the content with lists for arrays, and None for NaN and infinity, which JSON does not have."""
+    if isinstance(content, np.ndarray):
+        return finite(content.tolist())
     if isinstance(content, dict):
         return {key: finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):

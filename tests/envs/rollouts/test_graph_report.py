@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from envs.rollouts import graph_report
 from envs.rollouts.causal_labels import ON_ROADS
-from envs.rollouts.graph_report import as_json, markdown, plot_calibration, plot_curve, shown, write_picture
+from envs.rollouts.graph_report import markdown, plot_calibration, plot_curve, shown, write_picture
 from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, score_rule
 
@@ -64,7 +64,7 @@ def test_edges_to_the_ego_have_a_table_of_their_own():
 
 
 def test_json_has_the_bins():
-    found = as_json(RESULT)["scores"]["ours"]
+    found = asdict(RESULT)["scores"]["ours"]
     assert len(found["bins"]) == 10 and sum(one["pairs"] for one in found["bins"]) == 40
     assert found["f1"] == {"value": 1.0, "interval": (1.0, 1.0)}
 

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pytest
 from matplotlib import pyplot as plt
 from rich.console import Console
 
-from envs.rollouts.plan_report import as_json, markdown, plot_choices, plot_errors, shown, write_picture
+from envs.rollouts.plan_report import markdown, plot_choices, plot_errors, shown, write_picture
 from envs.rollouts.plan_run import Benefit, EnvPlans, PlanScores
 from predictor.evaluation.standard_errors import Estimate
 
@@ -44,7 +44,7 @@ def test_the_terminal_has_the_same_cells():
 
 
 def test_the_json_has_the_numbers():
-    assert as_json(RESULT)["scores"]["ours"]["own"]["reduction"]["value"] == 0.2
+    assert asdict(RESULT)["scores"]["ours"]["own"]["reduction"]["value"] == 0.2
 
 
 def test_curves_have_the_numbers():

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 
@@ -8,11 +8,12 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, LEADER_CELL
-from envs.rollouts.reaction_report import as_json, markdown, plot_cell, remarks, shown, write_picture
+from envs.rollouts.reaction_report import markdown, plot_cell, remarks, shown, write_picture
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
 from envs.rollouts.reactions import STRAIGHT, Perturbation
 from predictor.evaluation.reactions import Reaction
 from predictor.evaluation.standard_errors import Estimate
+from predictor.support.files import finite
 
 REACTION = Reaction(
     20,
@@ -80,10 +81,10 @@ def test_a_narrow_terminal_cuts_nothing_off():
 
 
 def test_json_has_every_shift():
-    found = as_json(RESULT)
+    found = finite(asdict(RESULT))
     assert found["perturbations"][0]["true_m"] == [[1.0, 1.0], [1.0, 1.0]]
     assert found["perturbations"][0]["predicted_m"] == {"ours": [[0.0, 0.0], [0.0, 0.0]]}
-    assert found["cells"][0]["reactions"]["ours"]["slope"] == {"value": 0.8, "interval": (0.7, 0.9)}
+    assert found["cells"][0]["reactions"]["ours"]["slope"] == {"value": 0.8, "interval": [0.7, 0.9]}
 
 
 @pytest.mark.parametrize(("cell", "predicted_m"), [(LEADERS, [0.0, 4.0, 8.88]), (BYSTANDERS, [0.0, 4.5, 9.0])])
