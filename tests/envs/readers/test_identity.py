@@ -58,6 +58,11 @@ def test_a_pair_at_the_gate_is_none():
         assert len(best_pairs(np.array([[cost]]), 2.0)[0]) == pairs
 
 
+def test_a_pair_beyond_the_gate_does_not_decide_who_else_is_paired():
+    rows, columns = best_pairs(np.array([[0.0, 1.9], [1.0, 100.0]]), 2.0)
+    assert rows.tolist() == columns.tolist() == [0]  # the dearer two pairs gain 1.1, this one 2
+
+
 def test_first_choices_need_no_search(monkeypatch: pytest.MonkeyPatch):
     """One leaves or one enters: still everybody's nearest is the answer."""
     monkeypatch.setattr("scipy.optimize.linear_sum_assignment", None)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from predictor.support import files
@@ -125,6 +126,7 @@ def test_others_may_read_what_the_umask_lets_them_read(tmp_path: Path):
 def test_what_json_does_not_have_becomes_none_at_any_depth():
     nested = {"a": float("nan"), "b": {"c": (1.0, float("inf"))}, "d": [{"e": -float("inf")}], "f": "nan", "g": None}
     assert finite(nested) == {"a": None, "b": {"c": [1.0, None]}, "d": [{"e": None}], "f": "nan", "g": None}
+    assert finite({"a": np.array([[1.0, np.nan], [np.inf, 2.0]])}) == {"a": [[1.0, None], [None, 2.0]]}
 
 
 # --- Full and read-only disks -----------------------------------------------------------------------------------------
