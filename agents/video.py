@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -16,6 +16,7 @@ from envs.readers.highway import is_highway_env
 from envs.registry import entry_for
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
+from envs.video.film import Film
 from envs.video.film_forecasts import FilmForecasts, record_pictures, view_of
 from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
@@ -76,23 +77,6 @@ def _with_forecasts(task: Task) -> Task | None:
     return None
 
 
-@runtime_checkable
-class Recorded(Protocol):
-    """Played episode, which can be drawn."""
-
-    fps: int
-    """Number of pictures per second."""
-
-    def __len__(self) -> int:
-        """Returns the number of pictures."""
-
-    def draw(self, index: int, /) -> Any:
-        """Returns a picture as an array of uint8 (height, width, 3)."""
-
-    def write_video(self, path: str | Path, /) -> None:
-        """Writes all pictures as a video."""
-
-
 def film(
     task: Task, model: BaseAlgorithm, path: Path, seed: int = EVALUATION_SEED, max_steps: int | None = None
 ) -> Path | None:
@@ -128,7 +112,7 @@ def _in_highway_env(task: Task) -> Task:
 
 def recorded(
     task: Task, model: BaseAlgorithm, seed: int = EVALUATION_SEED, max_steps: int | None = None
-) -> Recorded | None:
+) -> Film | None:
     """Plays an episode of `film` and returns it; None if the environment cannot be drawn.
 
     An id of EnvPool is played in the environment of highway-env that it is a copy of.

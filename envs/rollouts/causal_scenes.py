@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float, Int
 
 from envs.readers.highway_labels import LEADER
 from envs.rollouts.causal_labels import CausalSettings, causal_labels
+from envs.rollouts.cause_run import CauseTask
 from envs.rollouts.moving import moving_agents
-from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
 from envs.seeding import label_rng
 from predictor.evaluation.pair_trees import pair_features
@@ -28,24 +29,12 @@ FIRST_STEP = 3
 """First step with labels; forecasters have seen the motion by then."""
 
 
-@dataclass(frozen=True)
-class GraphTask:
+@dataclass(frozen=True, kw_only=True)
+class GraphTask(CauseTask):
     """Settings of one episode; can be pickled."""
 
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints that infer edges; the first one's perception holds for all."""
-    seed: int
-    """Seed of the episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
     settings: CausalSettings
     """How labels are measured."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +60,7 @@ class EdgeScene:
 
 def play_graph(task: GraphTask) -> list[EdgeScene]:
     """Plays one episode and returns its scenes with labels."""
-    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
-    world.reset(task.seed)
+    world = task.opened()
     found = checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
     forecasters = {name: SideForecaster(forecaster, world.spec, 1) for name, forecaster in found.items()}
     first = int(label_rng(task.seed).integers(EVERY))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.side_forecasts import kept_world
 from envs.rollouts.workers import EpisodePool, Result
 from envs.rollouts.world import World, open_world
 from envs.supervision import TIMEOUT_S
@@ -43,3 +44,39 @@ class CauseRun:
     def pool(self, play: Callable[[Any], Result]) -> EpisodePool[Result]:
         """Returns the processes that play this measurement's tasks; a context manager."""
         return episode_pool(play, self.workers, self.timeout_s, cluster=self.cluster)
+
+    def of_episode(self, number: int, checkpoints: tuple[str, ...]) -> dict[str, Any]:
+        """Returns the arguments of a `CauseTask`.
+
+        Args:
+            number: number of the episode.
+            checkpoints: those that fit the environment.
+        """
+        return {
+            "env_id": self.env_id, "driver": self.driver, "checkpoints": checkpoints, "seed": self.seed + number,
+            "max_steps": self.max_steps, "env_kwargs": self.env_kwargs,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class CauseTask:
+    """Settings of one episode; can be pickled."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints to measure; the first one's perception holds for all."""
+    seed: int
+    """Seed of the episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
+
+    def opened(self) -> World:
+        """Returns the world of the episode, reset; a process keeps it for its next one."""
+        world = kept_world(self.env_id, self.driver, self.checkpoints, self.env_kwargs)
+        world.reset(self.seed)
+        return world

@@ -63,10 +63,7 @@ def measure_graph(run: CauseRun) -> EnvGraph:
     spec, settings = world.spec, settings_for(world)
     world.close()
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
-    tasks = [
-        GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings, run.env_kwargs)
-        for i in range(run.episodes)
-    ]
+    tasks = [GraphTask(**run.of_episode(i, fitting), settings=settings) for i in range(run.episodes)]
     with run.pool(play_graph) as pool:
         episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)

@@ -15,9 +15,10 @@ from envs.plans import PlanModel, checked_plans, plan_model_for
 from envs.plans.base import Plans
 from envs.plans.contact import contacts
 from envs.rollouts.branches import Branch, BranchPoint
+from envs.rollouts.cause_run import CauseTask
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.reactions import STRAIGHT
-from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import EgoWorld, World
 from envs.seeding import plan_rng
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -31,24 +32,12 @@ FIRST_STEP = 3
 """First such step; forecasters have seen the motion by then."""
 
 
-@dataclass(frozen=True)
-class PlanTask:
+@dataclass(frozen=True, kw_only=True)
+class PlanTask(CauseTask):
     """Settings of one episode; can be pickled."""
 
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints that forecast; the first one's perception holds for all."""
-    seed: int
-    """Seed of the episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
     horizon_steps: int
     """Number of steps forecast and played."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +69,7 @@ def play_plans(task: PlanTask) -> list[PlanMoment]:
 
     Those after which the time limit ends a branch without a collision are left out: what follows is not known.
     """
-    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
-    world.reset(task.seed)
+    world = task.opened()
     model = plan_model_for(world.env)
     found = {STRAIGHT: ConstantVelocity(world.spec)} | checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
     forecasters = {

@@ -141,10 +141,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
     world.close()
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
-    tasks = [
-        PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon, run.env_kwargs)
-        for i in range(run.episodes)
-    ]
+    tasks = [PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon) for i in range(run.episodes)]
     with run.pool(play_plans) as pool:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]

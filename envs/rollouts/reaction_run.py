@@ -124,15 +124,7 @@ def _play_until_enough(
             wave = range(played, min(played + 2 * pool.size, run.episodes))
             tasks = [
                 ReactionTask(
-                    run.env_id,
-                    run.driver,
-                    checkpoints,
-                    run.seed + i,
-                    horizon_steps,
-                    run.max_steps,
-                    wanted,
-                    run.stores,
-                    run.env_kwargs,
+                    **run.of_episode(i, checkpoints), horizon_steps=horizon_steps, cells=wanted, stores=run.stores
                 )
                 for i in wave
             ]

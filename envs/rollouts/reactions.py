@@ -21,8 +21,9 @@ from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint
 from envs.rollouts.causal_labels import ON_ROADS, settings_for
+from envs.rollouts.cause_run import CauseTask
 from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
-from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
 from envs.seeding import reaction_rng
 from envs.simulators.interventions import Intervention
@@ -45,28 +46,16 @@ SAME_PATH_M = 2.0
 """Largest distance of two paths that count as one [m]: half a lane's width."""
 
 
-@dataclass(frozen=True)
-class ReactionTask:
+@dataclass(frozen=True, kw_only=True)
+class ReactionTask(CauseTask):
     """Settings of one episode; can be pickled."""
 
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints that forecast; the first one's perception holds for all."""
-    seed: int
-    """Seed of the episode."""
     horizon_steps: int
     """Number of steps forecast and played."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
     cells: tuple[str, ...]
     """Names of the cells to measure; what is found in one does not depend on the others."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +84,7 @@ class Perturbation:
 
 def play_reactions(task: ReactionTask) -> list[Perturbation]:
     """Plays one episode and returns its perturbations."""
-    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
-    world.reset(task.seed)
+    world = task.opened()
     forecasters = _forecasters(task, world.spec)
     rng = reaction_rng(task.seed)
     found: list[Perturbation] = []

@@ -6,7 +6,6 @@ its pictures map the world: a `View`, of ten lines or less, given here or regist
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -17,7 +16,8 @@ from PIL import Image
 from envs.readers.highway import is_highway_env
 from envs.readers.outcomes import outcome_keys
 from envs.video.drawing import AgentOverlay, OverlayStyle, View, draw_overlay
-from envs.video.files import decode_png, encode_png, write_video
+from envs.video.files import decode_png, encode_png
+from envs.video.film import Film
 from envs.video.highway import forecast_shown, large_viewer, with_forecasts
 from predictor.support.errors import UserError
 
@@ -165,7 +165,7 @@ class FilmForecasts(gym.Wrapper[Any, Any, Any, Any]):
 
 
 @dataclass
-class PictureRecording:
+class PictureRecording(Film):
     """Pictures of a played episode, one for each step."""
 
     fps: int
@@ -181,10 +181,6 @@ class PictureRecording:
     def draw(self, index: int) -> Picture:
         """Returns a picture."""
         return np.asarray(decode_png(self._pngs[index]))
-
-    def write_video(self, path: str | Path) -> None:
-        """Writes the video as MP4 (H.264, yuv420p); `path` is never a partial file."""
-        write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
 
 def record_pictures(

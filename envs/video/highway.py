@@ -9,7 +9,6 @@ to an action.
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -28,7 +27,8 @@ from envs.video.drawing import (
     View,
     draw_overlay,
 )
-from envs.video.files import decode_png, encode_png, write_picture, write_video
+from envs.video.files import decode_png, encode_png
+from envs.video.film import Film
 from envs.wrappers import ForecastObservation
 from predictor.scene import SceneBatch
 from predictor.support.errors import UserError
@@ -65,7 +65,7 @@ class _Step:
 
 
 @dataclass
-class Recording:
+class Recording(Film):
     """Played episode, which can be drawn."""
 
     env_id: str
@@ -131,14 +131,6 @@ class Recording:
             words.append(f"{step.action} {step.reward:+.2f}")
         words.append(f"return {gained:.2f}")
         return "   ".join([*words, "crashed"] if at_end and self.crashed else words)
-
-    def write_video(self, path: str | Path) -> None:
-        """Writes the video as MP4 (H.264, yuv420p); `path` is never a partial file."""
-        write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
-
-    def write_frame(self, path: str | Path, index: int) -> None:
-        """Writes one annotated picture as PNG."""
-        write_picture(path, self.draw(index))
 
     def _truth(self, key: int, step: _Step) -> Float[np.ndarray, "points 2"]:
         """Returns an agent's positions within the horizon of a forecast, one per picture, while it was on the road."""

@@ -10,7 +10,6 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from envs.video.drawing import (
     fan,
     page_width,
 )
-from envs.video.files import write_picture, write_video
+from envs.video.film import Film
 from envs.video.moments import Body, Moment, bodies_now
 from envs.video.roles import LANDMARK, OTHER, mean_by_role, named_role
 from predictor.support.errors import UserError
@@ -106,7 +105,7 @@ class _Seen:
 
 
 @dataclass
-class MultiagentRecording:
+class MultiagentRecording(Film):
     """Played episode, which can be drawn."""
 
     env_id: str
@@ -165,14 +164,6 @@ class MultiagentRecording:
         arena = self._draw_arena(step, part / self.frames_per_step)
         above = self._roles(self._moments[step].returns)
         return draw_page(arena, self._caption(index), above, self._legend, self._width_px, self.style.lines)
-
-    def write_video(self, path: str | Path) -> None:
-        """Writes the video as MP4 (H.264, yuv420p); `path` is never a partial file."""
-        write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
-
-    def write_frame(self, path: str | Path, index: int) -> None:
-        """Writes one picture as PNG."""
-        write_picture(path, self.draw(index))
 
     @property
     def extent_m(self) -> Float[np.ndarray, "2 axes"]:

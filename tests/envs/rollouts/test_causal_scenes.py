@@ -98,7 +98,7 @@ def test_who_is_not_perceived_is_left_out():
 
 def task(checkpoint: str, **changes: Any) -> GraphTask:
     settings: dict[str, Any] = {"seed": 900_000, "max_steps": 12, "settings": IN_ARENAS} | changes
-    return GraphTask(TAG, "heuristic", (checkpoint,), **settings)
+    return GraphTask(env_id=TAG, driver="heuristic", checkpoints=(checkpoint,), **settings)
 
 
 def test_an_episode_has_labels_at_every_fifth_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -134,9 +134,20 @@ def test_the_true_plan_is_what_the_ego_does_in_the_plain_branch(monkeypatch: pyt
     np.testing.assert_array_equal(plans[0], [scene.states[0] for scene in played(world, HORIZON)])
 
 
+def plan_task(env_id: str, driver: str, seed: int, max_steps: int, horizon_steps: int) -> PlanTask:
+    return PlanTask(
+        env_id=env_id,
+        driver=driver,
+        checkpoints=("constant-velocity",),
+        seed=seed,
+        max_steps=max_steps,
+        horizon_steps=horizon_steps,
+    )
+
+
 @pytest.mark.slow
 def test_moments_come_at_every_fifth_step_from_a_random_one_on():
-    task = PlanTask("highway-fast-v0", "idle", ("constant-velocity",), 7, 16, 2)
+    task = plan_task("highway-fast-v0", "idle", 7, 16, 2)
     moments = play_plans(task)
     first = int(plan_rng(7).integers(EVERY))
     assert moments and all(m.step % EVERY == first and m.step >= FIRST_STEP and m.seed == 7 for m in moments)
@@ -149,7 +160,7 @@ def test_moments_come_at_every_fifth_step_from_a_random_one_on():
 def own_moments(env_id: str, driver: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Steps of the moments of an episode of seed 8 with a horizon of four steps, each step one if it counts."""
     monkeypatch.setattr(plan_moments, "EVERY", 1)
-    return [found.step for found in play_plans(PlanTask(OWN + env_id, driver, ("constant-velocity",), 8, 30, 4))]
+    return [found.step for found in play_plans(plan_task(OWN + env_id, driver, 8, 30, 4))]
 
 
 def test_plans_that_a_time_limit_cuts_are_no_moments(monkeypatch: pytest.MonkeyPatch):

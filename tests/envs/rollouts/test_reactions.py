@@ -308,8 +308,8 @@ def test_no_more_is_tried_than_allowed(branches: list[tuple[Branch, Any]], monke
 def task(env_id: str, checkpoints: tuple[str, ...], steps: int = 3, **changes: Any) -> ReactionTask:
     names = tuple(cell.name for cell in ON_LANES + ELSEWHERE)
     driver = "heuristic" if env_id == TAG else "idle"
-    settings = {"cells": names, "max_steps": 12, **changes}
-    return ReactionTask(env_id, driver, checkpoints, 900_000, steps, **settings)
+    settings = {"cells": names, "max_steps": 12, "seed": 900_000, "horizon_steps": steps, **changes}
+    return ReactionTask(env_id=env_id, driver=driver, checkpoints=checkpoints, **settings)
 
 
 def assert_equal(found: list[Perturbation], expected: list[Perturbation]) -> None:
