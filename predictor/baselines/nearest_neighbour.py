@@ -53,16 +53,15 @@ class NearestNeighbour(nn.Module):
         spec: layout of the scenes.
         examples: examples, at least one; if fewer than `k`, all of them are averaged.
         k: number of neighbours to average.
-        num_edge_types: number of edge types of the (empty) edge output, to match a learned forecaster's.
-        edge_feature_dim: number of edge features of the (empty) edge output.
 
     Raises:
         UserError: there are no examples or no steps, or `k` is below 1.
     """
 
-    def __init__(
-        self, spec: SceneSpec, examples: Examples, k: int = K, num_edge_types: int = 2, edge_feature_dim: int = 1
-    ) -> None:
+    num_edge_types = 2
+    edge_feature_dim = 1
+
+    def __init__(self, spec: SceneSpec, examples: Examples, k: int = K) -> None:
         """Scales the examples and arranges them in blocks."""
         super().__init__()
         count, horizon_steps, _ = examples.displacements.shape
@@ -72,8 +71,6 @@ class NearestNeighbour(nn.Module):
             )
         self.spec = spec
         self.horizon_steps = horizon_steps
-        self.num_edge_types = num_edge_types
-        self.edge_feature_dim = edge_feature_dim
         self.k = min(k, count)
         self.num_examples = count
         features = examples.features.double()
@@ -105,8 +102,6 @@ class NearestNeighbour(nn.Module):
         k: int = K,
         max_examples: int = MAX_EXAMPLES,
         seed: int = 0,
-        num_edge_types: int = 2,
-        edge_feature_dim: int = 1,
     ) -> "NearestNeighbour":
         """Fits a forecaster of up to `horizon_steps` steps to recorded episodes; see `collect_examples`.
 
@@ -114,7 +109,7 @@ class NearestNeighbour(nn.Module):
             UserError: no agent of the episodes has a future of that length, or a number is below 1.
         """
         examples = collect_examples(episodes, spec, horizon_steps, max_examples, seed)
-        return cls(spec, examples, k, num_edge_types, edge_feature_dim)
+        return cls(spec, examples, k)
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Returns a memory without content."""
@@ -276,8 +271,6 @@ def fit_from_stores(
     k: int = K,
     max_examples: int = MAX_EXAMPLES,
     seed: int = 0,
-    num_edge_types: int = 2,
-    edge_feature_dim: int = 1,
 ) -> NearestNeighbour:
     """Fits nearest neighbours for scenes of `spec` to episode stores.
 
@@ -289,8 +282,6 @@ def fit_from_stores(
         k: number of neighbours to average.
         max_examples: largest number of examples; of more, this many are drawn.
         seed: random seed of that draw.
-        num_edge_types: number of edge types of the (empty) edge output.
-        edge_feature_dim: number of edge features of the (empty) edge output.
 
     Raises:
         UserError: a store cannot be read, has other features, time step or ego, or there is no example.
@@ -306,7 +297,7 @@ def fit_from_stores(
                 "record a store of the same kind"
             )
         episodes += store.episodes
-    return NearestNeighbour.fit(episodes, spec, horizon_steps, k, max_examples, seed, num_edge_types, edge_feature_dim)
+    return NearestNeighbour.fit(episodes, spec, horizon_steps, k, max_examples, seed)
 
 
 def _complete(

@@ -100,12 +100,12 @@ def scene_of(layout: SceneSpec, seed: int, scenes: int = 2, agents: int = 4) -> 
 
 
 def test_is_a_forecaster_without_edges():
-    forecaster = fit_random(spec(), num_edge_types=3, edge_feature_dim=4)
+    forecaster = fit_random(spec())
     assert isinstance(forecaster, Forecaster)
     assert (forecaster.spec, forecaster.horizon_steps) == (spec(), HORIZON)
     belief = observe(forecaster, random_states(0, 2, 3, 4))
-    assert torch.equal(belief.edge_probs, torch.tensor([1.0, 0.0, 0.0]).expand(2, 3, 3, 3))
-    assert torch.equal(belief.edge_features, torch.zeros(2, 3, 3, 4))
+    assert torch.equal(belief.edge_probs, torch.tensor([1.0, 0.0]).expand(2, 3, 3, 2))
+    assert torch.equal(belief.edge_features, torch.zeros(2, 3, 3, 1))
 
 
 @pytest.mark.shapes
@@ -525,8 +525,8 @@ def test_a_store_is_fitted_with_the_perception_asked_for(tmp_path: Path):
     assert torch.equal(forecaster.points, expected.points)
     assert forecaster.num_examples == 6 * 2 * 7
     assert fit_from_stores([path], spec(max_agents=2), HORIZON).num_examples == 6 * 7
-    small = fit_from_stores([path], spec(), HORIZON, "here", 2, 10, 1, num_edge_types=3, edge_feature_dim=4)
-    assert (small.k, small.num_examples, small.num_edge_types, small.edge_feature_dim) == (2, 10, 3, 4)
+    small = fit_from_stores([path], spec(), HORIZON, "here", 2, 10, 1)
+    assert (small.k, small.num_examples) == (2, 10)
 
 
 def test_a_store_of_another_kind_is_refused(tmp_path: Path):
