@@ -36,7 +36,6 @@ class SpringLeastSquares:
     Args:
         spec: layout of the springs' store.
         horizon_steps: default number of steps to forecast.
-        physics: physics of the box, springs only; None takes the published one.
         smallest_constant: smallest spring constant of the data [N/m]; pairs below half of it have no spring.
     """
 
@@ -47,16 +46,13 @@ class SpringLeastSquares:
         self,
         spec: SceneSpec,
         horizon_steps: int = 10,
-        physics: Physics | None = None,
         smallest_constant: float = SMALLEST_CONSTANT,
     ) -> None:
         """Stores the arguments; nothing is learned."""
-        physics = physics or Physics()
-        if physics.kind != "springs" or spec.position_dim != 2 or spec.has_ego:
+        if spec.position_dim != 2 or spec.has_ego:
             raise UserError("least squares needs springs in a plane without an ego; use another model")
         self.spec = spec
         self.horizon_steps = horizon_steps
-        self.physics = physics
         self.smallest_constant = smallest_constant
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
@@ -94,10 +90,8 @@ class SpringLeastSquares:
         """Integrates the law; all samples are equal."""
         physics = Physics(
             num_agents=belief.states.shape[1],
-            box_m=self.physics.box_m,
             dt_s=self.spec.dt_s,
             frames=horizon_steps + 1,
-            substeps=self.physics.substeps,
         )
         states = belief.states.double()
         rolled = simulate(physics, belief.internal.constants, states[..., :2], states[..., 2:])
@@ -106,7 +100,7 @@ class SpringLeastSquares:
 
     def _near_wall(self, states: Tensor) -> Tensor:
         reach = states[..., 2:4].abs() * self.spec.dt_s
-        near: Tensor = (states[..., :2].abs() + reach > self.physics.box_m).any(-1)
+        near: Tensor = (states[..., :2].abs() + reach > Physics.box_m).any(-1)
         return near
 
     def _solve(self, equations: Tensor, pairs: Tensor) -> Float[Tensor, "batch agents agents"]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from predictor.data.dataset_card import most_present
-from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.store import Episode, StoreInfo, read_info_of, read_store, write_store
 from predictor.data.store_files import check_new_store
 from predictor.scene import MOST_AGENTS
 from predictor.support.command_line import parse
@@ -106,7 +106,7 @@ def main() -> None:
     config = parse(CrowdConfig, __doc__)
     check_new_store(config.out, config.overwrite)
     crowds = make_crowds(config)
-    source = read_store(config.source).info
+    source = read_info_of(config.source)
     made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}
     spec = replace(source.spec, max_agents=max(source.spec.max_agents, most_present(crowds)))
     write_store(config.out, StoreInfo(spec, f"{source.source}, overlaid", made), crowds, config.overwrite)

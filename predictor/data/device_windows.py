@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from predictor.data.window_tensors import cast, cut, join
-from predictor.data.windows import WindowBatch, Windows, window_batch
+from predictor.data.window_tensors import WindowBatch, cast, cut, join
+from predictor.data.windows import Windows
 from predictor.support.errors import UserError
 
 _CHUNK = 1 << 22
@@ -79,7 +79,7 @@ class ResidentWindows:
         episode, now = self._episode.index_select(0, indices), self._now.index_select(0, indices)
         casts = cast(self._flat, episode, now, history, self._width, self.has_ego)
         steps = time or history + self.horizon_steps
-        return window_batch(cut(self._flat, episode, now, casts, history, self.horizon_steps, steps, self.agents))
+        return cut(self._flat, episode, now, casts, history, self.horizon_steps, steps, self.agents)
 
 
 def bytes_needed(windows: Sequence[Windows]) -> int:

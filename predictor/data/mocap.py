@@ -104,7 +104,7 @@ def read_trial(path: Path, skeleton: Skeleton, config: MocapConfig) -> list[Epis
     Raises:
         UserError: the file is broken; names file and line.
     """
-    positions_m = joint_positions(skeleton, read_motion(path, skeleton).values)
+    positions_m = joint_positions(skeleton, read_motion(path, skeleton))
     episodes = []
     for phase in range(config.stride if config.all_phases else 1):
         kept = positions_m[phase :: config.stride]

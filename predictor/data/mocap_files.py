@@ -211,16 +211,11 @@ def _three(values: list[float]) -> tuple[float, float, float]:
     return x, y, z
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Recorded channels of all bones, in the skeleton's order."""
-
-    values: Float[np.ndarray, "time channels"]
-    """Angles [deg]; root translations in the file's unit."""
-
-
-def read_motion(path: Path, skeleton: Skeleton) -> Motion:
+def read_motion(path: Path, skeleton: Skeleton) -> Float[np.ndarray, "time channels"]:
     """Reads an .amc file that was recorded with the skeleton.
+
+    Returns:
+        Channels of all bones, in the skeleton's order: angles [deg]; root translations in the file's unit.
 
     Raises:
         UserError: frames are not consecutive, or bones are unknown, missing or have too few values; names file and
@@ -252,7 +247,7 @@ def read_motion(path: Path, skeleton: Skeleton) -> Motion:
     _check_frame(path, number, flags, set(columns) - seen)
     if not frames:
         raise UserError(f"{path} holds no frame; get the file anew")
-    return Motion(np.array(frames))
+    return np.array(frames)
 
 
 def _columns(skeleton: Skeleton) -> dict[str, slice]:

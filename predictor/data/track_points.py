@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from predictor.data.store import Episode
 from predictor.support.errors import UserError
@@ -30,10 +30,6 @@ class TrackPoints:
     def __len__(self) -> int:
         """Returns the number of points."""
         return len(self.steps)
-
-    def where(self, keep: Bool[np.ndarray, " points"]) -> "TrackPoints":
-        """Returns the points to keep."""
-        return TrackPoints(self.steps[keep], self.tracks[keep], self.states[keep])
 
 
 def with_velocities(

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from predictor.data.store import Episode
-from predictor.data.window_tensors import cut
-from predictor.data.windows import WindowBatch, Windows, window_batch
+from predictor.data.window_tensors import WindowBatch, cut
+from predictor.data.windows import Windows
 from predictor.scene import SceneSpec
 
 MOVED = 0.01
@@ -89,7 +89,7 @@ class Twins:
         agents = int(casts.size.max())
         time = min(history, int(now.max()) + 1) + self._horizon
         branches, twins = (
-            window_batch(cut(windows.flat, episode, now, casts, history, self._horizon, time, agents))
+            cut(windows.flat, episode, now, casts, history, self._horizon, time, agents)
             for windows in (self._branches, self._twins)
         )
         both = _future(branches, branches.valid, self._horizon) & _future(twins, twins.valid, self._horizon)

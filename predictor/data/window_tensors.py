@@ -5,7 +5,7 @@ so the same code cuts windows on a CPU and on an accelerator. `predictor.data.wi
 `predictor.data.device_windows` keeps windows on a device.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from predictor.graph import pair_mask
 
@@ -82,14 +83,47 @@ class FlatEpisodes:
 
 
 @dataclass(frozen=True)
-class Cut:
-    """Tensors of a window batch, see `predictor.data.windows.WindowBatch`."""
+class WindowBatch:
+    """Windows of equal length, padded at the end; columns are agents."""
 
     states: Float[Tensor, "batch time agents state"]
+    """States, world frame [SI]."""
     valid: Bool[Tensor, "batch time agents"]
+    """Whether the agent is visible, up to `last_observed`; afterwards, whether it is present and was visible then."""
     last_observed: Int[Tensor, " batch"]
-    edge_types: Int[Tensor, "batch time agents agents"] | None
-    edge_attributes: Float[Tensor, "batch time agents agents attributes"] | None
+    """Index of the last step that a forecaster may see."""
+    edge_types: Int[Tensor, "batch time agents agents"] | None = None
+    """True type of each edge, receiver first; -1 where unknown or absent."""
+    edge_attributes: Float[Tensor, "batch time agents agents attributes"] | None = None
+    """Known properties of each edge; zeros where unknown or absent."""
+
+    def to(self, device: torch.device) -> "WindowBatch":
+        """Returns the windows on another device."""
+        return self._each(lambda tensor: tensor.to(device))
+
+    def pinned_to(self, device: torch.device) -> "WindowBatch":
+        """Returns the windows on an accelerator, by a copy that neither side waits for."""
+        return self._each(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
+
+    def rows(self, rows: slice) -> "WindowBatch":
+        """Returns some of the windows, with the padding of all."""
+        return self._each(lambda tensor: tensor[rows])
+
+    def behind_absent(self) -> "WindowBatch":
+        """Returns the windows behind an absent agent, for a forecaster with an ego where no agent is the ego."""
+        types, attributes = self.edge_types, self.edge_attributes
+        return WindowBatch(
+            pad(self.states, (0, 0, 1, 0)),
+            pad(self.valid, (1, 0)),
+            self.last_observed,
+            None if types is None else pad(types, (1, 0, 1, 0), value=UNKNOWN_TYPE),
+            None if attributes is None else pad(attributes, (0, 0, 1, 0, 1, 0)),
+        )
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in given.items()}
+        return WindowBatch(**changed)
 
 
 def flatten(
@@ -181,7 +215,7 @@ def cut(
     horizon_steps: int,
     time: int,
     agents: int,
-) -> Cut:
+) -> WindowBatch:
     """Cuts windows of the given size, padded at the end.
 
     Args:
@@ -211,7 +245,7 @@ def cut(
     valid = torch.where(observed, _pick(flat.visible, entry), later)
     states = _pick(flat.states, torch.where(valid, entry, padding))
     labels = [_cut_labels(f, episode, step, agent, columns, valid) for f in (flat.edge_types, flat.edge_attributes)]
-    return Cut(states, valid, last, *labels)
+    return WindowBatch(states, valid, last, *labels)
 
 
 def _cut_labels(

@@ -5,64 +5,20 @@ then are followed while they exist, visible or not: that is the truth a forecast
 intervention that begins after its last observed step: nobody could foresee it.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
 from predictor.data.store import Episode
-from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
+from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, WindowBatch, cast, cut, flatten
 from predictor.scene import SceneSpec, perceived_agents
 from predictor.support.errors import UserError
-
-
-@dataclass(frozen=True)
-class WindowBatch:
-    """Windows of equal length, padded at the end; columns are agents."""
-
-    states: Float[Tensor, "batch time agents state"]
-    """States, world frame [SI]."""
-    valid: Bool[Tensor, "batch time agents"]
-    """Whether the agent is visible, up to `last_observed`; afterwards, whether it is present and was visible then."""
-    last_observed: Int[Tensor, " batch"]
-    """Index of the last step that a forecaster may see."""
-    edge_types: Int[Tensor, "batch time agents agents"] | None = None
-    """True type of each edge, receiver first; -1 where unknown or absent."""
-    edge_attributes: Float[Tensor, "batch time agents agents attributes"] | None = None
-    """Known properties of each edge; zeros where unknown or absent."""
-
-    def to(self, device: torch.device) -> "WindowBatch":
-        """Returns the windows on another device."""
-        return self._each(lambda tensor: tensor.to(device))
-
-    def pinned_to(self, device: torch.device) -> "WindowBatch":
-        """Returns the windows on an accelerator, by a copy that neither side waits for."""
-        return self._each(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
-
-    def rows(self, rows: slice) -> "WindowBatch":
-        """Returns some of the windows, with the padding of all."""
-        return self._each(lambda tensor: tensor[rows])
-
-    def behind_absent(self) -> "WindowBatch":
-        """Returns the windows behind an absent agent, for a forecaster with an ego where no agent is the ego."""
-        types, attributes = self.edge_types, self.edge_attributes
-        return WindowBatch(
-            pad(self.states, (0, 0, 1, 0)),
-            pad(self.valid, (1, 0)),
-            self.last_observed,
-            None if types is None else pad(types, (1, 0, 1, 0), value=UNKNOWN_TYPE),
-            None if attributes is None else pad(attributes, (0, 0, 1, 0, 1, 0)),
-        )
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
-        given = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in given.items()}
-        return WindowBatch(**changed)
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
@@ -138,7 +94,7 @@ class Windows:
         history = min(history_steps or self.history_steps, int(now.max()) + 1)
         casts = self.cast(episode, now, history)
         agents, time = max(1, int(casts.size.max())), history + self.horizon_steps
-        return window_batch(cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents))
+        return cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents)
 
     def cast(self, episode: Int[Tensor, " batch"], now: Int[Tensor, " batch"], history_steps: int) -> Casts:
         """Returns the agents that take part in windows, given by their episodes and last observed steps.
@@ -155,11 +111,6 @@ class Windows:
                 f"{int(now[window])}"
             )
         return casts
-
-
-def window_batch(parts: Cut) -> WindowBatch:
-    """Returns windows as a batch."""
-    return WindowBatch(parts.states, parts.valid, parts.last_observed, parts.edge_types, parts.edge_attributes)
 
 
 def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int) -> Int[np.ndarray, "windows 2"]:
@@ -201,18 +152,15 @@ def padded(batch: WindowBatch, time: int, agents: int) -> WindowBatch:
     """Returns the windows with absent agents and steps appended, up to the given size."""
     if batch.valid.shape[1:] == (time, agents):
         return batch
-    states, valid = _grown(batch.states, (time, agents), 0), _grown(batch.valid, (time, agents), 0)
-    pairs = (time, agents, agents)
-    types = None if batch.edge_types is None else _grown(batch.edge_types, pairs, UNKNOWN_TYPE)
-    attributes = None if batch.edge_attributes is None else _grown(batch.edge_attributes, pairs, 0)
-    return WindowBatch(states, valid, batch.last_observed, types, attributes)
-
-
-def _grown(tensor: Tensor, size: tuple[int, ...], fill: int) -> Tensor:
-    """Returns the tensor with its axes after the first grown to `size`."""
-    grown = tensor.new_full((len(tensor), *size, *tensor.shape[1 + len(size) :]), fill)
-    grown[(slice(None), *(slice(n) for n in tensor.shape[1 : 1 + len(size)]))] = tensor
-    return grown
+    later, others = time - batch.valid.shape[1], agents - batch.valid.shape[2]
+    types, attributes = batch.edge_types, batch.edge_attributes
+    return WindowBatch(
+        pad(batch.states, (0, 0, 0, others, 0, later)),
+        pad(batch.valid, (0, others, 0, later)),
+        batch.last_observed,
+        None if types is None else pad(types, (0, others, 0, others, 0, later), value=UNKNOWN_TYPE),
+        None if attributes is None else pad(attributes, (0, 0, 0, others, 0, others, 0, later)),
+    )
 
 
 def concatenate(batches: Sequence[WindowBatch]) -> WindowBatch:

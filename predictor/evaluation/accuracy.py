@@ -270,15 +270,14 @@ class Tally:
         solid = valid if outcome.carried is None else valid & ~outcome.carried[..., None]
         values["overlap"] = metrics.overlap(forecast, solid, self._threshold_m, outcome.mode_probs)
         values["true_overlap"] = metrics.overlap(future[:, None], solid, self._threshold_m)
+        equal_probs = forecast.new_full(forecast.shape[:3], 1 / forecast.shape[1])
         if outcome.scale is not None:
-            probs = outcome.mode_probs
-            if probs is None:
-                probs = forecast.new_full(forecast.shape[:3], 1 / forecast.shape[1])
+            probs = equal_probs if outcome.mode_probs is None else outcome.mode_probs
             values["mixture_nll"] = metrics.mixture_nll(forecast, future, valid, probs, outcome.scale)
             values["mixture_coverage"] = metrics.mixture_coverage(forecast, future, valid, probs, outcome.scale)
         if len(self._std_m) >= max(1, horizon):
-            std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)
-            values["nll"] = metrics.gaussian_mixture_nll(forecast, future, valid, std_m)
+            std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)[:, None].expand_as(forecast)
+            values["nll"] = metrics.mixture_nll(forecast, future, valid, equal_probs, std_m)
         return values
 
     def _missed(self, forecast: Tensor, future: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:

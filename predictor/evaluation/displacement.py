@@ -109,26 +109,6 @@ def squared_error(
     return (mean - future).square().sum(-1), valid
 
 
-def gaussian_mixture_nll(
-    forecast: Float[Tensor, "batch samples agents horizon axes"],
-    future: Float[Tensor, "batch agents horizon axes"],
-    valid: Bool[Tensor, "batch agents horizon"],
-    std_m: Float[Tensor, " horizon"],
-) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """Computes the negative log-likelihood [nats] of the truth under equal isotropic Gaussians around the samples.
-
-    Args:
-        forecast: sampled positions [m].
-        future: true positions [m].
-        valid: which entries count.
-        std_m: standard deviation per axis at each step [m], fitted on other data.
-    """
-    axes = forecast.shape[-1]
-    distance_sq = displacement(forecast, future).square()
-    log_density = -distance_sq / (2 * std_m**2) - axes * (torch.log(std_m) + 0.5 * math.log(2 * math.pi))
-    return math.log(forecast.shape[1]) - torch.logsumexp(log_density, dim=1), valid
-
-
 LEAST_STD_M = 1e-3
 """Smallest standard deviation of a mode that counts [m]: a likelihood has no upper bound as it goes to zero."""
 

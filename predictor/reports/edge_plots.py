@@ -173,10 +173,9 @@ def graphs_figure(
         counted = np.triu(known) if symmetric else known
         right, all_pairs = int((found == truth)[counted].sum()), int(counted.sum())
         axes[0, column].set_title(f"{_percentile(column)} window: {window.place}\ntruth", fontsize=10)
-        what = "pairs" if symmetric else "ordered pairs"
-        axes[1, column].set_title(
-            f"inferred: edge or none right for\n{right} of {all_pairs} {what} ({right / all_pairs:.2f})", fontsize=10
-        )
+        share, what = right / max(1, all_pairs), "pairs" if symmetric else "ordered pairs"
+        found_line = f"inferred: edge or none right for\n{right} of {all_pairs} {what} ({share:.2f})"
+        axes[1, column].set_title(found_line, fontsize=10)
         for ax in axes[:, column]:
             _frame(ax, on_circle)
     figure.legend(handles=_edge_legend(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)

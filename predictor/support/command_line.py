@@ -19,7 +19,7 @@ from docstring_parser import parse_from_object
 
 from predictor.support.config_checks import check_numbers
 from predictor.support.errors import UserError
-from predictor.support.provenance import commit_at_start
+from predictor.support.provenance import commit_at_start, program
 
 Config = TypeVar("Config")
 
@@ -58,7 +58,7 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
-            config = tyro.cli(config_class, prog=_program(), description=description, args=words)
+            config = tyro.cli(config_class, prog=" ".join(program()), description=description, args=words)
     except SystemExit as leaving:
         if (error := _user_error_behind(leaving)) is not None:
             raise error from None
@@ -111,15 +111,6 @@ def _for_help(config_class: Any, hidden: Collection[str]) -> Any:
         elif place.default is not MISSING:
             content[place.name] = place.default
     return dataclass(frozen=True)(type(config_class.__name__, (config_class,), content))
-
-
-def _program() -> str | None:
-    """Returns how a module was called, as "python -m envs.collect"; None for a script, which has a name."""
-    main = sys.modules["__main__"]
-    spec = getattr(main, "__spec__", None)
-    if spec is None or sys.argv[0] != getattr(main, "__file__", None):  # the command dgvae sets its own
-        return None
-    return f"python -m {spec.name}"
 
 
 def _user_error_behind(error: BaseException | None) -> UserError | None:

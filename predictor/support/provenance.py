@@ -16,7 +16,7 @@ from typing import Any
 def provenance(packages: Sequence[str], command: str | None = None) -> dict[str, Any]:
     """Returns command line, git commit (with "+changes" if the tree is dirty), package versions, machine, UTC time."""
     if command is None:
-        command = " ".join([*_program(), *map(shlex.quote, sys.argv[1:])])
+        command = " ".join([*program(), *map(shlex.quote, sys.argv[1:])])
     return {
         "command": command.encode("utf-8", "backslashreplace").decode(),  # names of files may be no UTF-8
         "commit": commit_at_start(),
@@ -26,7 +26,7 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
     }
 
 
-def _program() -> list[str]:
+def program() -> list[str]:
     """Returns the words before the options: "dgvae collect", "python -m module" or "python script"."""
     if sys.argv[0].startswith("dgvae "):
         return [sys.argv[0]]

@@ -87,7 +87,7 @@ def pose(folder: Path, frame: str) -> np.ndarray:
     path = folder / "pose.amc"
     path.write_text(amc(frame))
     skeleton = read_skeleton(folder / "07.asf")
-    return joint_positions(skeleton, read_motion(path, skeleton).values)[0] / UNIT_M
+    return joint_positions(skeleton, read_motion(path, skeleton))[0] / UNIT_M
 
 
 # --- Forward kinematics -----------------------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ def test_the_real_recordings_stand_on_the_ground(subject: str, trials: int, fram
     assert (len(paths), len(skeleton.bones)) == (trials, 31)
     total = 0
     for path in paths:
-        joints_m = joint_positions(skeleton, read_motion(path, skeleton).values)
+        joints_m = joint_positions(skeleton, read_motion(path, skeleton))
         total += len(joints_m)
         for i, parent in enumerate(skeleton.parents[1:], start=1):
             length_m = np.linalg.norm(joints_m[:, i] - joints_m[:, parent], axis=-1)

@@ -12,7 +12,6 @@ from predictor.evaluation.displacement import (
     LEAST_STD_M,
     coverage,
     displacement,
-    gaussian_mixture_nll,
     min_ade,
     min_displacement,
     min_fde,
@@ -37,6 +36,12 @@ def along_x(*xs: float) -> Tensor:
 def one_agent(*samples: Tensor) -> Tensor:
     """A forecast (1, samples, 1, horizon, 2)."""
     return torch.stack(samples)[None, :, None]
+
+
+def nll_of_equal_samples(forecast: Tensor, future: Tensor, valid: Tensor, std_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Likelihood under equal isotropic Gaussians around the samples; `std_m` is that of each step."""
+    probs = torch.full(forecast.shape[:3], 1 / forecast.shape[1])
+    return mixture_nll(forecast, future, valid, probs, std_m[:, None].expand_as(forecast))
 
 
 STANDING = along_x(0, 0, 0)[None, None]
@@ -161,13 +166,13 @@ def test_displacement_keeps_samples_apart():
     ids=["k1", "k2"],
 )
 def test_nll_closed_form(forecast: Tensor, expected: list[float]):
-    value, counts = gaussian_mixture_nll(forecast, STANDING, ALL, torch.tensor([1.0, 1.0, 3.0]))
+    value, counts = nll_of_equal_samples(forecast, STANDING, ALL, torch.tensor([1.0, 1.0, 3.0]))
     assert value[0, 0].tolist() == pytest.approx(expected, rel=1e-5)
     assert torch.equal(counts, ALL)
 
 
 def test_nll_of_a_far_miss_is_large_but_finite():
-    value, _ = gaussian_mixture_nll(one_agent(along_x(1e4, 1e4, 1e4)), STANDING, ALL, torch.full((3,), 0.1))
+    value, _ = nll_of_equal_samples(one_agent(along_x(1e4, 1e4, 1e4)), STANDING, ALL, torch.full((3,), 0.1))
     assert value[0, 0, 0].item() == pytest.approx(1e8 / 0.02, rel=1e-3)
 
 
@@ -183,15 +188,6 @@ def test_mixture_nll_is_that_of_a_mixture_of_normal_distributions():
     value, counts = mixture_nll(forecast, future, torch.ones(2, 3, 4).bool(), probs, scale)
     torch.testing.assert_close(value, -mixture.log_prob(future))
     assert counts.all()
-
-
-def test_mixture_nll_of_equal_modes_is_that_of_equal_samples():
-    generator = torch.Generator().manual_seed(0)
-    forecast, std_m = torch.randn(2, 4, 3, 3, 2, generator=generator), torch.tensor([0.5, 1.0, 2.0])
-    future, valid = torch.zeros(2, 3, 3, 2), torch.ones(2, 3, 3).bool()
-    scale = std_m[:, None].expand(forecast.shape)
-    value, _ = mixture_nll(forecast, future, valid, torch.full((2, 4, 3), 0.25), scale)
-    torch.testing.assert_close(value, gaussian_mixture_nll(forecast, future, valid, std_m)[0])
 
 
 def test_mixture_nll_of_a_mode_without_scale_has_the_least_one():
@@ -519,7 +515,7 @@ def test_nll_is_that_of_a_normal_distribution_of_so_many_axes(axes: int):
     forecast, future = torch.randn(2, 1, 3, 4, axes, generator=generator), torch.zeros(2, 3, 4, axes)
     std_m = torch.tensor([0.5, 1.0, 2.0, 4.0])
     normal = torch.distributions.Normal(forecast[:, 0], std_m[:, None])
-    value, _ = gaussian_mixture_nll(forecast, future, torch.ones(2, 3, 4).bool(), std_m)
+    value, _ = nll_of_equal_samples(forecast, future, torch.ones(2, 3, 4).bool(), std_m)
     torch.testing.assert_close(value, -normal.log_prob(future).sum(-1))
 
 
@@ -533,7 +529,7 @@ PER_AGENT: dict[str, Metric] = {
     "min_displacement": min_displacement,
     "squared_error": squared_error,
     "coverage": lambda f, t, v: coverage(f, t, v, share=0.5),
-    "nll": lambda f, t, v: gaussian_mixture_nll(f, t, v, torch.full(t.shape[2:3], 1.5)),
+    "nll": lambda f, t, v: nll_of_equal_samples(f, t, v, torch.full(t.shape[2:3], 1.5)),
     "mixture_nll": lambda f, t, v: mixture_nll(f, t, v, torch.full(f.shape[:3], 1 / f.shape[1]), 1 + f.abs()),
     "mixture_coverage": lambda f, t, v: mixture_coverage(
         f, t, v, torch.full(f.shape[:3], 1 / f.shape[1]), torch.ones_like(f)
