@@ -72,7 +72,12 @@ def evaluate_policy_on_seeds(
         first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
         drivers: names of drivers that are compared beside the arena's baselines ("planner").
+
+    Raises:
+        UserError: fewer than one episode.
     """
+    if num_episodes < 1:
+        raise UserError(f"num_episodes must be at least 1, got {num_episodes}")
     seeds = range(first_seed, first_seed + num_episodes)
     arena = open_arena(task, min(num_envs, num_episodes))
     try:
@@ -343,7 +348,8 @@ def _film(trained: _Trained, evaluation: Evaluation, out: Path) -> dict[str, dic
 
     films = film_extremes(trained.task, trained.model(), next(iter(evaluation.results.values())), out)
     names = ", ".join(film["file"] for film in films.values())
-    Console().print(f"films: {names or 'none, no view of this environment is registered'}")
+    without = "EnvPool's episodes cannot be drawn" if trained.task.env_id in ENV_IDS else "no view of it is registered"
+    Console().print(f"films: {names or f'none of {trained.task.env_id}: {without}'}")
     return films
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from agents.episode_file import has_pyarrow
 from agents.results import PACKAGES
 from agents.studies.cells import Cell, cells_of
 from agents.studies.findings import Findings
@@ -19,7 +20,7 @@ from agents.studies.plan import Study, read_study, shipped_studies, study_file
 from agents.studies.pool import run_cells
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
-from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
+from agents.studies.results import RESULT_FILE, Result, read_result, write_tables
 from envs.registry import envpool_task_of
 from envs.simulators.envpool import begins_alike
 from predictor.support.cluster import check_address, connected
@@ -85,7 +86,8 @@ def run_study(config: StudyConfig) -> int:
     Raises:
         UserError: the study file, the folder or a result in it is not as it must be; nothing has been run then.
     """
-    require_tables()
+    if not has_pyarrow():
+        raise UserError("a study writes Parquet tables, which need pyarrow; pip install 'dgvae-rl[study]'")
     file = study_file(config.study)
     study, text = read_study(file), file.read_text(encoding="utf-8")
     if config.headroom:

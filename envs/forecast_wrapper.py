@@ -151,8 +151,13 @@ def unflatten(env: Any, observation: NDArray[Any], agent: str | None = None) -> 
         agent: name of the agent, in a PettingZoo environment.
 
     Raises:
-        UserError: observations are not flattened, or this one has another size; no such wrapper.
+        UserError: observations are not flattened, or this one has another size; no such wrapper; an agent is named
+            outside PettingZoo, or none within.
     """
+    if agent is not None and not hasattr(env, "possible_agents"):
+        raise UserError(
+            f"unflatten takes the name of an agent in PettingZoo environments alone, got {agent!r}; omit it"
+        )
     try:
         get: Any = getattr(env, "get_wrapper_attr", None)
         found: Any = env.unflatten if get is None else get("unflatten")

@@ -7,7 +7,6 @@ and keeps the rest. A cell that was killed goes on from its checkpoint and ends 
 
 import functools
 import hashlib
-import importlib.metadata
 import json
 import shlex
 import sys
@@ -39,7 +38,7 @@ from predictor.checkpoint import read_info, resolve
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers
-from predictor.support.provenance import provenance
+from predictor.support.provenance import installed_version, provenance
 
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
@@ -112,16 +111,16 @@ class Cell:
             "task": task,
             "forecaster": _content_of(self.forecaster),
             "test": [EVALUATION_SEED, self.episodes],
-            "versions": {name: _version(name) for name in RULES},
+            "versions": {name: installed_version(name) for name in RULES},
         }
         if (module := content_of_module(self.task.env_id)) is not None:
             content["module"] = module
         if self.plan is None:
             return content | {"driver": self.line}
         if self.plan.algorithm in CONTRIB:
-            content["versions"]["sb3-contrib"] = _version("sb3-contrib")
+            content["versions"]["sb3-contrib"] = installed_version("sb3-contrib")
         if self.task.backend == "envpool":
-            content["versions"]["envpool"] = _version("envpool")
+            content["versions"]["envpool"] = installed_version("envpool")
         if self.task.observe != "none":
             content["network"] = NETWORK
         unrelated = {"task", "device", "in_process", "selection_envs", "settings"}
@@ -291,10 +290,3 @@ def _run_config(cell: Cell) -> dict[str, Any]:
 
 def _command() -> str:
     return shlex.join(["python", "-m", "agents.study", *sys.argv[1:]])  # a cell's process has the study's arguments
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"

@@ -74,18 +74,6 @@ def read_result(path: Path) -> Result:
         ) from error
 
 
-def require_tables() -> None:
-    """Checks that pyarrow is there.
-
-    Raises:
-        UserError: it is not.
-    """
-    try:
-        importlib.import_module("pyarrow.parquet")
-    except ImportError as error:
-        raise UserError("a study writes Parquet tables, which need pyarrow; pip install 'dgvae-rl[study]'") from error
-
-
 def write_tables(folder: Path, results: Sequence[Result]) -> None:
     """Writes a line per test episode and a line per measurement in training, of all results, as Parquet."""
     _write_parquet(folder / EPISODES_FILE, [_labels(r) | _columns(e) for r in results for e in r.episodes])

@@ -7,7 +7,7 @@ the list's first vehicle. Parking, lane keeping and the multi-agent intersection
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,16 +27,6 @@ _FIXED_MAP: tuple[AxisFrame, AxisFrame] = ("world", "world")
 _STRAIGHT_ROADS = ("Highway-v0", "HighwayFast-v0", "TwoWay-v0")
 _CHANGE_WEIGHT = 0.1  # as `IdentityTracker`
 _STATE = tuple(map(attrgetter, ("x", "y", "speed", "heading")))
-
-
-class EnvPoolLike(Protocol):
-    """Attributes of an environment that `EnvPoolReader` reads."""
-
-    task_id: str
-    envpool_config: Mapping[str, Any]
-
-    def debug_states(self) -> Sequence[Any]:
-        """Returns EnvPool's own description of the one environment."""
 
 
 def is_envpool_env(env: gym.Env) -> bool:
@@ -241,7 +231,7 @@ class EnvPoolReader(Reader):
             raise UserError(
                 f"EnvPoolReader needs an EnvPoolEnv (envs.simulators.envpool), got {type(env.unwrapped).__name__}"
             )
-        inner: EnvPoolLike = env.unwrapped  # type: ignore[assignment]
+        inner: Any = env.unwrapped
         super().__init__(envpool_spec(inner.task_id, inner.envpool_config, perception_m, max_agents))
         self._env = np.zeros(1, dtype=np.int64)
         self._pool = PoolReader(self._spec, 1)
@@ -252,6 +242,6 @@ class EnvPoolReader(Reader):
 
     def read_all(self, env: gym.Env) -> Scene:
         """Returns every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
-        inner: EnvPoolLike = env.unwrapped  # type: ignore[assignment]
+        inner: Any = env.unwrapped
         scenes = self._pool.read_all(inner.debug_states(), self._env)
         return Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0]))

@@ -5,6 +5,7 @@ with each plan of the environment's plan model, all with equal random numbers. E
 others will do if the ego does what it then did, or follows the plan; and how likely the plan ends in a collision.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,7 +117,7 @@ def moment(
     scene = world.perceived()
     plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features, scene, world.spec)
     point = BranchPoint(world, horizon_steps, perturbs=False)
-    played = [point.plain, *(point.driven(_Script(actions)) for actions in _scripts(plans, model))]
+    played = [point.plain, *(point.driven(_taking(actions)) for actions in _scripts(plans, model))]
     ego = int(point.ids[0])
     crashed = np.array([ego in branch.crashed for branch in played])
     whole = all(hit or not branch.cut for hit, branch in zip(crashed, played, strict=True))
@@ -145,14 +146,10 @@ def moment(
     return PlanMoment(seed, step, crashed, whole, agents, without_m, with_m, risk, risk_of_planner)
 
 
-class _Script:
-    """Driver that takes given actions, whatever it sees."""
-
-    def __init__(self, actions: tuple[object, ...]) -> None:
-        self._actions = iter(actions)
-
-    def __call__(self, obs: object) -> object:
-        return next(self._actions)
+def _taking(actions: Iterable[object]) -> Callable[[object], object]:
+    """Returns a driver that takes these actions, whatever it sees."""
+    left = iter(actions)
+    return lambda _: next(left)
 
 
 def _scripts(plans: Plans, model: PlanModel) -> list[tuple[object, ...]]:

@@ -1,13 +1,13 @@
 """A running environment with its driver and its true scenes, for collection and evaluation.
 
-`World` is one interface for environments with one ego (gymnasium) and with many learners (PettingZoo). Scenes come out
-of the wrappers that a policy is trained with, so that the deployed scenes are recorded and measured.
+`EgoWorld` (gymnasium, one ego) and `MultiagentWorld` (PettingZoo, many learners) have one interface. Scenes come out of
+the wrappers that a policy is trained with, so that the deployed scenes are recorded and measured.
 """
 
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -46,55 +46,6 @@ from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
 
 
-@runtime_checkable
-class World(Protocol):
-    """Environment with its drivers."""
-
-    env: Any
-    """Environment in its wrapper."""
-
-    @property
-    def spec(self) -> SceneSpec:
-        """Layout of the scenes."""
-
-    def generators(self) -> list[np.random.Generator]:
-        """Random streams of simulator and drivers."""
-
-    def reset(self, seed: int) -> None:
-        """Begins the episode of a seed: environment and drivers are a function of it."""
-
-    def drive(self, driver: str) -> None:
-        """Lets another driver act from the next reset on.
-
-        Args:
-            driver: name of a driver that needs no forecasts; no policy.
-
-        Raises:
-            UserError: unknown driver, or one that does not fit the environment.
-        """
-
-    def step(self) -> bool:
-        """Lets all agents act once; returns whether the episode is over."""
-
-    def perceived(self) -> Scene:
-        """Returns the scene that forecasters get, padded."""
-
-    def reread(self) -> tuple[Scene, Scene]:
-        """Reads anew what forecasters get and all agents, without a step: after an intervention at once."""
-
-    def full_scene(self) -> Scene:
-        """Returns all agents, unpadded: the truth."""
-
-    def labels(self) -> SceneLabels | None:
-        """Returns the true edges between the agents of `full_scene`; None where the simulator has none."""
-
-    def forecast(self, num_samples: int) -> Forecast:
-        """Returns the deployed forecast of the perceived scene with this number of samples: a batch of one."""
-
-    def close(self) -> None:
-        """Closes the environment."""
-
-
 class EgoWorld:
     """Gymnasium environment with one ego.
 
@@ -110,7 +61,7 @@ class EgoWorld:
 
     def __init__(self, env: SceneObservation | ForecastObservation, driver: str, env_id: str | None = None) -> None:
         """Keeps environment and driver; resets nothing."""
-        self.env = env
+        self.env: Any = env
         self._place, self._id = Place(), env_id or (env.spec.id if env.spec else type(env.unwrapped).__name__)
         self._name = driver
         self._reader: SceneReader = env.get_wrapper_attr("reader")
@@ -139,7 +90,7 @@ class EgoWorld:
         self._ego = make_ego_driver(self._name, self.env, self._rng)
 
     def drive(self, driver: str) -> None:
-        """Lets another driver, no policy, act from the next reset on.
+        """Lets another driver, one that needs no forecasts, act from the next reset on.
 
         Raises:
             UserError: see `make_ego_driver`.
@@ -152,7 +103,7 @@ class EgoWorld:
         self._ego = driver
 
     def step(self) -> bool:
-        """Lets the ego act.
+        """Lets the ego act; returns whether the episode is over.
 
         Raises:
             EnvironmentFailedError: the environment raised, or its driver.
@@ -172,11 +123,11 @@ class EgoWorld:
         return [self._rng] if own is None else [self._rng, own]
 
     def reread(self) -> tuple[Scene, Scene]:
-        """Reads anew what the ego perceives and all agents."""
+        """Reads anew what the ego perceives and all agents, without a step: after an intervention at once."""
         return self._reader.read(self.env), _unpadded(self._reader.read_all(self.env))
 
     def perceived(self) -> Scene:
-        """Returns the ego's perceived scene."""
+        """Returns the scene that forecasters get: what the ego perceives, padded."""
         scene: Scene = self.env.scene
         return scene
 
@@ -186,7 +137,7 @@ class EgoWorld:
             return _unpadded(self._reader.read_all(self.env))
 
     def forecast(self, num_samples: int) -> Forecast:
-        """Returns the forecast of the perceived scene, from the wrapper's own stream."""
+        """Returns the deployed forecast of the perceived scene, from the wrapper's own stream: a batch of one."""
         assert isinstance(self.env, ForecastObservation)
         return self.env.stream.again(num_samples)
 
@@ -217,7 +168,7 @@ class MultiagentWorld:
 
     def __init__(self, env: ForecastParallelEnv, driver: str, env_id: str | None = None) -> None:
         """Keeps the environment and checks that the driver fits; resets nothing."""
-        self.env = env
+        self.env: Any = env
         self._place, self._id = Place(), env_id or multiagent_env_id(env)
         self._name = driver
         self._observations: dict[str, Any] = {}
@@ -242,7 +193,7 @@ class MultiagentWorld:
         self._driver = self._make_driver(self._rng)
 
     def drive(self, driver: str) -> None:
-        """Lets another driver, no policy, act from the next reset on.
+        """Lets another driver, one that needs no forecasts, act from the next reset on.
 
         Raises:
             UserError: see `make_driver`.
@@ -251,7 +202,7 @@ class MultiagentWorld:
         self._name = driver
 
     def step(self) -> bool:
-        """Lets all agents act.
+        """Lets all agents act; returns whether the episode is over.
 
         Raises:
             EnvironmentFailedError: the environment raised, or a driver.
@@ -301,6 +252,10 @@ class MultiagentWorld:
             return make_driver(self._name, self.env, rng)
         aside = own_view(self.env)
         return trained_driver(self._name, self.env if aside is None else aside.env, rng)
+
+
+World = EgoWorld | MultiagentWorld
+"""Environment with its drivers."""
 
 
 def open_world(

@@ -20,7 +20,8 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
     return {
         "command": command.encode("utf-8", "backslashreplace").decode(),  # names of files may be no UTF-8
         "commit": commit_at_start(),
-        "versions": {name: _version(name) for name in ("dgvae-rl", *packages)} | {"python": platform.python_version()},
+        "versions": {name: installed_version(name) for name in ("dgvae-rl", *packages)}
+        | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
@@ -40,7 +41,8 @@ def _module_or_script() -> list[str]:
     return [Path(sys.argv[0]).name]
 
 
-def _version(package: str) -> str:
+def installed_version(package: str) -> str:
+    """Returns the version of a package, or "not installed"."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

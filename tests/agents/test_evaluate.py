@@ -28,6 +28,11 @@ def test_all_policies_play_the_same_held_out_seeds():
         assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]
 
 
+def test_no_episodes_are_refused():
+    with pytest.raises(UserError, match="num_episodes must be at least 1, got 0"):
+        evaluate_policy_on_seeds(Task(TOY, "none"), "idle", "idle", 0)
+
+
 @pytest.mark.slow
 def test_the_planner_is_a_policy_and_a_line_of_the_table():
     """A driver in the place of a trained policy, and another one beside the baselines; each name once."""

@@ -75,3 +75,5 @@ def test_what_is_no_flattened_observation_is_named():
         unflatten(wrapped(False), row)
     with pytest.raises(UserError, match="unflatten needs an environment with forecasts, got DictCrowd"):
         unflatten(DictCrowd(), row)
+    with pytest.raises(UserError, match="an agent in PettingZoo environments alone, got 'stays'; omit it"):
+        unflatten(flat, row, "stays")

@@ -50,7 +50,7 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
     ):
         after = {cell.title: cell.name for cell in cells(**changes)}
         assert {title for title in before if after[title] != before[title]} == other, changes
-    monkeypatch.setattr("agents.studies.cells._version", lambda name: "0.0")
+    monkeypatch.setattr("agents.studies.cells.installed_version", lambda name: "0.0")
     assert not set(before.values()) & {cell.name for cell in cells()}
 
 

@@ -412,7 +412,7 @@ def test_headroom_runs_floor_and_ceiling_alone(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_without_pyarrow_nothing_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"need pyarrow; pip install 'dgvae-rl\[study\]'"):
         run_study(config(tmp_path, study_text()))
     assert not (tmp_path / "out").exists()
