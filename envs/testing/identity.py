@@ -13,6 +13,10 @@ from predictor.scene import SceneSpec
 FAR = 10.0
 """Error of a predicted position, in typical errors, from which an agent is said to be elsewhere than it should."""
 
+FEWEST, COMMON = 3, 1e-3
+"""Number of ids that seem to change hands, and their share of all ids at all steps, from which it is no coincidence: an
+agent that stops just where another one starts. One that is farther off than a fast agent moves in a step never is."""
+
 NEAR = 1e-3
 """Distance, in scales of positions, that is not told from standing still: parked cars sink into their springs."""
 
@@ -63,7 +67,11 @@ def identity_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]
     """Returns what is wrong with the ids, one line for each kind of mistake."""
     rule = _Rule.of(episodes, spec)
     problems: list[str] = []
-    for check in (_handed, _jumped, _returned):
+    handed = [found for episode in episodes for found in _handed(episode, rule)]
+    ids = sum(len(moment.ids) for episode in episodes for moment in episode.moments)
+    if len(handed) >= max(FEWEST, COMMON * ids) or any(error > rule.reach_m for error, _ in handed):
+        problems += [handed[0][1]]
+    for check in (_jumped, _returned):
         lines = [line for episode in episodes if (line := next(check(episode, rule), ""))]
         problems += lines[:1]
     if spec.has_ego:
@@ -78,8 +86,11 @@ def _row_numbers(episodes: Sequence[Episode]) -> bool:
     return all(np.array_equal(moment.ids, np.arange(len(moment.ids))) for moment in moments)
 
 
-def _handed(episode: Episode, rule: _Rule) -> Iterator[str]:
-    """Finds an id that is, after a step, where another id's agent should be, while that one's id is elsewhere."""
+def _handed(episode: Episode, rule: _Rule) -> Iterator[tuple[float, str]]:
+    """Finds ids that are, after a step, where another id's agent should be, while that one's id is elsewhere.
+
+    Yields how far off its course an id is, and the line that says so.
+    """
     for number, (first, second) in enumerate(episode.pairs()):
         rows = second.index_of
         for row, agent in enumerate(first.ids.tolist()):
@@ -92,8 +103,9 @@ def _handed(episode: Episode, rule: _Rule) -> Iterator[str]:
             other = _better(first, second, row, new, error, rule)
             if other is not None:
                 yield (
+                    error,
                     f"ids change hands: in step {number + 1} id {agent} is {error:.3g} m off its course, "
-                    f"there where id {other} should be; an id must stay with its agent"
+                    f"there where id {other} should be; an id must stay with its agent",
                 )
 
 
@@ -143,7 +155,7 @@ def _returned(episode: Episode, rule: _Rule) -> Iterator[str]:
             if error > rule.jump_m + 0.5 * rule.reach_m * gap:
                 yield (
                     f"an id returns: id {agent} was gone after step {seen} and came back in step {time}, {error:.3g} m "
-                    "from where its motion led; a new agent needs a new id"
+                    "from where its motion led; a new agent needs a new id, and so does one that comes back elsewhere"
                 )
             last[agent] = (time, moment.states[row])
 

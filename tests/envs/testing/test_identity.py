@@ -52,3 +52,25 @@ def test_two_that_change_ids_are_found():
     with_swap.moments[5:] = [Moment(m.states, m.ids[[1, 0, *range(2, 8)]], 0.0) for m in with_swap.moments[5:]]
     (found,) = [line for line in identity_problems([with_swap], SPEC) if "change hands" in line]
     assert "in step 5 id " in found
+
+
+def waiting(times: int) -> list[Episode]:
+    """Episodes of six vehicles at speeds of their own and two more: one stops just where the other one drives off."""
+    speeds = np.arange(10.0, 16.0)
+    episodes = []
+    for number in range(6):
+        moments = []
+        for t in range(12):
+            others = np.stack([t * speeds, 20.0 * np.arange(6), speeds, 0 * speeds], axis=1)
+            stopped, gone = number < times and t >= 6, max(0, t - 5)
+            arriving = [98.0 if stopped else 100.0 - 10 * (6 - t), -20.0, 0.0 if stopped else 10.0, 0.0]
+            waited = [98.0 + 5 * gone, -20.0, 5.0 * (gone > 0), 0.0]
+            moments.append(Moment(np.vstack([others, arriving, waited]), np.arange(8), 0.0))
+        episodes.append(Episode(moments))
+    return episodes
+
+
+def test_one_that_stops_just_where_another_one_starts_has_not_taken_its_id():
+    assert identity_problems(waiting(2), SPEC) == []
+    (found,) = identity_problems(waiting(6), SPEC)
+    assert "in step 6 id 6 is 2 m off its course, there where id 7 should be" in found
