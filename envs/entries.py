@@ -24,6 +24,8 @@ PATH_KEYS = ("ego_path", "closest")
 """Entries of every observation with forecasts, from `path_entries`."""
 UNCERTAINTY_KEYS = ("mode_probs", "xy_scale")
 """Entries with several samples, or on request (`ForecastConfig.uncertainty`); the second, if the forecaster has it."""
+SAME_M = 1e-4
+"""Difference of two distances that is rounding [m]."""
 WHAT_IF_KEYS = ("what_if_gap", "what_if_contact", "what_if_risk")
 """Entries for candidate plans of the ego (`ForecastConfig.num_plans`)."""
 
@@ -137,8 +139,8 @@ def path_entries(
 
     Returns:
         ego_path: (B, H, 2) positions of the ego along its axes [m].
-        closest: (B, A−1, 2) smallest distance to the agent at one time, now included [m], and its time as a share of
-            the horizon; zero where there is no agent.
+        closest: (B, A−1, 2) smallest distance to the agent at one time, now included [m], and its first time as a share
+            of the horizon; zero where there is no agent.
     """
     velocity = into_ego_axes(scenes.heading_rad) @ scenes.states[:, 0, 2:4, None]
     horizon = forecast.shape[-2]
@@ -150,7 +152,8 @@ def path_entries(
     future = forecast if forecast.ndim == 4 else forecast[:, :, 0]
     apart = future - path[:, None, 1:]
     gap_m = np.concatenate([np.hypot(*np.moveaxis(now, -1, 0))[..., None], np.hypot(apart[..., 0], apart[..., 1])], -1)
-    closest = np.stack([gap_m.min(-1), gap_m.argmin(-1) / horizon], -1)
+    first = (gap_m <= gap_m.min(-1, keepdims=True) + SAME_M).argmax(-1)  # of two that stand, now, whatever is rounded
+    closest = np.stack([gap_m.min(-1), first / horizon], -1)
     closest *= scenes.valid[envs, 1 + order][..., None]
     return {"ego_path": path[:, 1:].astype(np.float32), "closest": closest.astype(np.float32)}
 

@@ -70,8 +70,8 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
             )
         if key in ADDED_KEYS:
             raise UserError(
-                f"the own observation of {source} has an entry '{key}', as forecasts have; rename it with a wrapper "
-                "around the environment, in gymnasium with TransformObservation"
+                f"the own observation of {source} has an entry '{key}', as forecasts have; if it is wrapped already, "
+                "leave one wrapper out, else rename the entry with a wrapper (gymnasium: TransformObservation)"
             )
     return dict(space.spaces)
 

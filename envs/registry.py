@@ -148,7 +148,10 @@ def arguments_of(text: str) -> dict[str, Any]:
     try:
         kwargs = parse_json(text or "{}", "env_kwargs")
     except UserError as error:
-        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}: {error}") from error
+        why = str(error).removesuffix("; get it anew")
+        raise UserError(
+            f"env_kwargs must be a JSON object, got {short(repr(text))}: {why}; write '{{\"lanes\": 2}}'"
+        ) from error
     if not isinstance(kwargs, dict):
         raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}")
     if "env_id" in kwargs or "id" in kwargs:
@@ -209,7 +212,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     except UserError:
         raise
     except (gym.error.Error, ImportError) as error:
-        raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(_HIGHWAY)}") from error
+        own = "" if colon else f"give one of your own as module:{env_id}; "
+        raise UserError(f"cannot make env '{env_id}': {error}; {own}known here: {', '.join(_HIGHWAY)}") from error
     except Exception as error:
         given = {name: value for name, value in kwargs.items() if name not in _OF_GYMNASIUM}
         if given:

@@ -312,6 +312,9 @@ def check_futures(
     name = "rollout" if plans is None else "rollout_plans"
     if not isinstance(given, Futures):
         raise UserError(f"{name} of a forecaster must return Futures, got {type(given).__name__}")
+    for part in (given.states, given.mode_probs, given.scale):
+        if part is not None and not isinstance(part, Tensor):
+            raise UserError(f"{name} of a forecaster: Futures must hold tensors, got {type(part).__name__}")
     sizes = tuple(given.states.shape)
     if plans is None and len(sizes) == 5 and (sizes[1], sizes[3]) != (num_samples, steps):
         raise UserError(

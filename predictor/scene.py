@@ -123,7 +123,7 @@ class SceneSpec:
         if abs(self.dt_s - other.dt_s) > 1e-6:
             raise UserError(
                 f"{name} was trained at dt_s={self.dt_s:g} but {source} steps at dt_s={other.dt_s:g}; "
-                "retrain on its data or change the env's policy_frequency"
+                "retrain on its data, or change the step (your reader's SceneSpec; highway-env's policy_frequency)"
             )
 
     def check_recorded(self, other: "SceneSpec", name: str, source: str) -> None:
@@ -197,23 +197,23 @@ class Scene:
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
-        if not (np.abs(self.states) <= LARGEST).all():
+        right = (np.abs(self.states) <= LARGEST).all(axis=1)
+        if not right.all():
             finite = np.isfinite(self.states).all()
             wanted = f"at most {LARGEST:g} in size" if finite else "finite, those of padded agents too (zeros)"
-            bad = ~(np.abs(self.states) <= LARGEST).all(axis=1)
-            raise UserError(f"{source}: states must be {wanted}, got {some(self.states[bad].tolist())}")
+            got = f"{some(self.states[~right].tolist())} of ids {some(self.ids[~right].tolist())}"
+            raise UserError(f"{source}: states must be {wanted}, got {got}")
 
     def _check_arrays(self, source: str, spec: SceneSpec | None, agents: int | None) -> None:
-        for name, array, kind, wanted, axes in (
-            ("states", self.states, "f", "floating point", 2),
-            ("ids", self.ids, "iu", "integers", 1),
-            ("valid", self.valid, "b", "bool", 1),
+        for name, array, kind, wanted, axes, advice in (
+            ("states", self.states, "f", "floating point", 2, "; np.asarray(states, dtype=float) makes one"),
+            ("ids", self.ids, "iu", "integers", 1, "; agent_ids(names) (dgvae_rl) makes numbers of names"),
+            ("valid", self.valid, "b", "bool", 1, ""),
         ):
             if not isinstance(array, np.ndarray) or array.dtype.kind not in kind or array.ndim != axes:
                 got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-                named = "; agent_ids(names) (dgvae_rl) makes numbers of names" if name == "ids" else ""
                 raise UserError(
-                    f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}{named}"
+                    f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}{advice}"
                 )
         if not len(self.states) == len(self.ids) == len(self.valid):
             raise UserError(

@@ -124,6 +124,10 @@ def _rollout(trial: Trial) -> Iterator[str]:
         if not isinstance(futures, Futures):
             yield f"rollout must return Futures, got {type(futures).__name__}"
             return
+        states: Any = futures.states
+        if not isinstance(states, torch.Tensor):
+            yield f"rollout: states must be a tensor, got {type(states).__name__}; torch.from_numpy makes one"
+            return
         wanted = (SCENES, samples, AGENTS, steps, trial.spec.num_features)
         if tuple(futures.states.shape) != wanted:
             yield (

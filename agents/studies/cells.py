@@ -226,7 +226,8 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
         said = study.settings_of(scenario)
         return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task), said) for name in names]
     except UserError as error:
-        raise UserError(f"{place}: {error}") from error
+        left_out = f"; references = [] in the study file leaves {', '.join(names)} out" if names else ""
+        raise UserError(f"{place}: {error}{left_out}") from error
 
 
 def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> list[Cell]:

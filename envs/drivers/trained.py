@@ -18,6 +18,7 @@ import numpy as np
 from envs.arms import Arm
 from envs.drivers.all_agents import Driver, make_driver
 from envs.own_observation import carries_forecasts, space_without_added
+from envs.registry import entry_for
 from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -85,6 +86,11 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
         from envs.wrappers import ForecastObservation  # most drivers need no wrapper
 
         options = wrapper_options(name)
+        if not options and env.spec is not None and entry_for(env.spec.id).checkpoint is None:
+            raise UserError(
+                f"policy {name} does not say with which forecaster it was trained, and none ships for {env.spec.id}; "
+                "play it with Stable-Baselines3 in the wrapper of its training, or train it with train_policy.py"
+            )
         env = ForecastObservation(env, **options)
         require_view(env, name)
         if options:

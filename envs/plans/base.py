@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError, short
+from predictor.support.signatures import takes
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,14 @@ def checked_model(model: Any, demand: str = "what_if must be True, False,") -> P
     Raises:
         UserError: it is none, or its plans have no names, or the same ones.
     """
+    if isinstance(model, type):
+        raise UserError(f"{demand} or an object with names and plans, got a class: write {model.__name__}()")
     if not callable(getattr(model, "plans", None)) or not hasattr(model, "names"):
         raise UserError(
             f"{demand} or an object with names and plans(env, horizon_steps), got {model!r}; see docs/what_if.md"
         )
+    if not takes(model.plans, None, 1):
+        raise UserError(f"plans of plan model {type(model).__name__} must take an environment and horizon_steps")
     names = model.names
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names) or not names:
         raise UserError(f"names of plan model {type(model).__name__} must be texts, one or more, got {names!r}")

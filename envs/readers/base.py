@@ -121,7 +121,9 @@ def build_reader(make_reader: Any, env: Any) -> Any:
         UserError: it returns no `SceneReader`; the message says what to pass instead.
     """
     name = _name_of(make_reader)
-    advice = f"for a function that reads a scene, pass reader=FunctionReader({name}, SceneSpec(dt_s=...))"
+    advice = f"for a function that reads a scene, give FunctionReader({name}, SceneSpec(dt_s=...))"
+    if isinstance(make_reader, type):
+        advice = f"{name} needs read_all(env), and an __init__(self, env) that calls super().__init__(SceneSpec(...))"
     reader = _build(make_reader, env, advice)
     if not reader.spec.has_ego:
         raise UserError(
@@ -216,7 +218,8 @@ def _name_of(make_reader: Any) -> str:
 def _build(make_reader: Any, env: Any, advice: str) -> Any:
     """Calls `make_reader` and checks what both kinds of reader have in common."""
     if isinstance(make_reader, str):
-        make_reader = load_named(make_reader)
+        named, make_reader = make_reader, load_named(make_reader)
+        advice = advice.replace("(str, ", f"({named.partition(':')[2]}, ")
     name = _name_of(make_reader)
     if not callable(make_reader):
         raise UserError(f"reader= takes what makes a reader, a Reader class for example, got an object of {name}")

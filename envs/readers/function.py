@@ -7,6 +7,7 @@ from typing import Any
 from envs.readers.base import Reader, perceive, require_scene
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
+from predictor.support.signatures import takes
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,9 @@ class FunctionReader:
                 "FunctionReader needs a function read(env) -> Scene and a SceneSpec, got "
                 f"{type(self.read).__name__} and {type(self.spec).__name__}"
             )
+        if not takes(self.read, None):
+            name = getattr(self.read, "__name__", type(self.read).__name__)
+            raise UserError(f"{name} must take the environment and nothing else: define {name}(env) -> Scene")
 
     def __call__(self, env: Any) -> Reader:
         """Returns a reader for this environment."""

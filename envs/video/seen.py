@@ -160,7 +160,7 @@ def _label_scene(ax: Axes, scaled: bool) -> None:
     ax.plot([], [], color=PINK, lw=_EDGE_WIDTH_PT / 2, alpha=0.6, label="edge to the ego")
     ax.plot([], [], color=SKY, lw=_EDGE_WIDTH_PT / 2, alpha=0.6, label="edge from the ego")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=6, fontsize=_TEXT_PT)
-    ax.set(xlabel="x, along the ego's heading [m]", ylabel="y [m]")
+    ax.set(xlabel="x, along the ego's heading if it has one [m]", ylabel="y [m]")
 
 
 def _frame(

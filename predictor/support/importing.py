@@ -15,9 +15,11 @@ def load_named(path: str) -> Callable[..., Any]:
     """Imports what "module:function" names: a function, a class, or another object that can be called.
 
     Raises:
-        UserError: there is no such module, or it has no such function or class.
+        UserError: nothing is named, there is no such module, or it has no such function or class.
     """
-    module, _, name = path.partition(":")
+    module, colon, name = path.partition(":")
+    if not colon:
+        raise UserError(f"'{path}' must name a function or class as module:name")
     try:
         found: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
     except (ImportError, ValueError) as error:

@@ -475,3 +475,11 @@ def test_path_entries_take_the_most_probable_of_several_futures():
     forecast = np.array([[[[[4.0, 3.0]], [[1.0, 0.0]]]]], dtype=np.float32)  # two futures of one step
     found = path_entries(scenes, forecast, dt_s=1.0)["closest"]
     np.testing.assert_allclose(found, [[[5.0, 1.0]]])
+
+
+def test_two_that_stand_are_nearest_now_whatever_is_rounded():
+    states = np.array([[[0.0, 0.0, 0.0, 0.0], [6.2, 0.0, 0.0, 0.0]]])
+    scenes = SceneBatch(states, np.array([[0, 1]]), np.array([[True, True]]), np.zeros(1))
+    forecast = np.full((1, 1, 5, 2), [6.2, 0.0], dtype=np.float32)  # 6.19999980926…
+    assert float(forecast[0, 0, 0, 0]) < 6.2
+    np.testing.assert_allclose(path_entries(scenes, forecast, dt_s=1.0)["closest"], [[[6.2, 0.0]]], rtol=1e-6)

@@ -130,7 +130,10 @@ def test_copies_share_a_forward_with_dicts_too():
 def test_what_cannot_stay_beside_the_forecasts_is_named():
     box = gym.spaces.Box(0, 1, (2,))
     clash = gym.spaces.Dict({"valid": box})
-    with pytest.raises(UserError, match=r"of env 'a' has an entry 'valid', as forecasts have; rename it"):
+    with pytest.raises(
+        UserError,
+        match=r"of env 'a' has an entry 'valid', as forecasts have; if it is wrapped",
+    ):
         own_spaces(clash, "env 'a'")
     with pytest.raises(UserError, match=r"must be a flat Dict, but its entry 'deep' is a Dict; flatten it first"):
         own_spaces(gym.spaces.Dict({"deep": clash}), "env 'a'")
@@ -175,7 +178,10 @@ def test_a_dict_to_which_nothing_was_added_stays():
 
 def test_names_of_added_entries_are_refused_without_forecasts_too(highway_checkpoint: str):
     box = gym.spaces.Box(0, 1, (2,))
-    with pytest.raises(UserError, match=r"of env 'a' has an entry 'agents', as forecasts have; rename it"):
+    with pytest.raises(
+        UserError,
+        match=r"of env 'a' has an entry 'agents', as forecasts have; if it is wrapped",
+    ):
         check_unwrapped(gym.spaces.Dict({"agents": box, "position": box}), "env 'a'")
     for space in (box, gym.spaces.Dict({"position": box}), gym.spaces.Tuple([box])):
         check_unwrapped(space, "env 'a'")

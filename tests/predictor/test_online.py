@@ -298,6 +298,7 @@ def test_a_forecaster_that_gives_something_else_is_named_in_a_line():
         (lambda futures: Futures(futures.states[..., :2, :]), "was asked for 1 samples of 5 steps and gave 1 of 2"),
         (lambda futures: Futures(futures.states[:, :0]), "was asked for 1 samples of 5 steps and gave 0 of 5"),
         (lambda futures: futures.states, "rollout of a forecaster must return Futures, got Tensor"),
+        (lambda futures: Futures(futures.states.numpy()), "Futures must hold tensors, got ndarray"),  # type: ignore[arg-type]
         (lambda futures: Futures(futures.states * torch.nan), "forecasts numbers that are not finite; its weights are"),
         (
             lambda futures: Futures(futures.states, torch.full(futures.states.shape[:3], torch.nan)),

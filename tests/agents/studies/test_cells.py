@@ -184,8 +184,8 @@ def test_how_far_true_futures_reach_is_in_the_name(cells: Callable[..., list[Cel
     ("changes", "message"),
     [
         ({"env_id": "nope-v0"}, "scenario corridor: cannot make env 'nope-v0'"),
-        ({"references": '["planer"]'}, "scenario corridor: driver must be one of random, idle, .*, got 'planer'"),
-        ({"references": '["planner"]'}, "scenario corridor: "),
+        ({"references": '["planer"]'}, "scenario corridor: driver must be one of .*, got 'planer'.* leaves planer out"),
+        ({"references": '["planner"]'}, r"scenario corridor: .*; references = .. in the study file leaves planner out"),
         ({"references": '["idle"]', "env_id": "simple_tag_v3", "algorithms": '["dqn"]'}, None),
         ({"env_id": "racetrack-v1", "references": '["constant-actions"]'}, "corridor: constant-actions needs an env"),
         ({"env_id": "racetrack-v1", "references": "[]", "algorithms": '["dqn"]'}, "arm none: dqn needs a discrete act"),

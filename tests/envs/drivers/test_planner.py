@@ -192,6 +192,13 @@ class Blank(gym.Env):
     action_space = gym.spaces.Discrete(2)
 
 
+class Deaf:
+    names = ("on",)
+
+    def plans(self) -> Plans:
+        raise AssertionError
+
+
 class WithoutRewards:
     names = ("only",)
 
@@ -221,6 +228,11 @@ def test_environments_and_models_that_do_not_fit_are_refused():
         (lambda env, f: Planner(env, (f, "info")), "a forecaster needs spec, .*but tuple has no spec"),
         (lambda env, f: Planner(env, "absent"), "no checkpoint 'absent'"),
         (lambda env, f: Planner(env, f, True), "plan_model must be None, or an object with names and plans"),
+        (
+            lambda env, f: Planner(env, f, WithoutRewards),
+            "got a class: write WithoutRewards",
+        ),
+        (lambda env, f: Planner(env, f, Deaf()), "plans of plan model Deaf must take an environment and horizon_steps"),
         (lambda env, f: Planner(env, f, config=PlannerConfig(max_risk="0.1")), "max_risk must be a number, got '0.1'"),  # type: ignore[arg-type]
         (lambda env, f: Planner(env, f, config=PlannerConfig(horizon_steps=2.5)), "horizon_steps must be .*, got 2.5"),  # type: ignore[arg-type]
     ],

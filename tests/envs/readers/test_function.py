@@ -123,7 +123,7 @@ def test_the_function_is_named_in_errors():
 
 # --- What else may be passed as reader= -------------------------------------------------------------------------------
 
-ADVICE = r"for a function that reads a scene, pass reader=FunctionReader\({}, SceneSpec\(dt_s=...\)\)"
+ADVICE = r"for a function that reads a scene, give FunctionReader\({}, SceneSpec\(dt_s=...\)\)"
 
 
 def without_spec(env: Any) -> Any:
@@ -159,6 +159,30 @@ def test_what_makes_no_reader_is_named(wrapper: type[gym.Wrapper], reader: Any, 
     arguments = {} if wrapper is SceneObservation else {"checkpoint": "constant-velocity"}
     with pytest.raises(UserError, match=message):
         wrapper(Parade(), reader=reader, **arguments)
+
+
+class Headless(Reader):
+    def read_all(self, env: Any) -> Scene:
+        return read_parade(env)
+
+
+def test_a_class_that_makes_no_reader_is_told_what_it_needs():
+    with pytest.raises(UserError, match="Headless gives .*Headless needs read_all"):
+        build_reader(type("Headless", (Headless,), {"__init__": lambda self, env: None}), Parade())
+
+
+def test_a_function_that_takes_no_environment_is_named():
+    with pytest.raises(UserError, match="read_nowhere must take the environment and nothing else"):
+
+        def read_nowhere() -> Scene:
+            raise AssertionError
+
+        FunctionReader(read_nowhere, SPEC)  # type: ignore[arg-type]
+
+
+def test_a_module_is_no_reader():
+    with pytest.raises(UserError, match="'tests.envs.own_code' must name a function or class as module:name"):
+        build_reader("tests.envs.own_code", Parade())
 
 
 def test_a_reader_in_place_of_its_class_is_named():
