@@ -1,7 +1,7 @@
 """Settings that the measurements of causes share: reactions, inferred edges, plans."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from envs.rollouts.cluster_pool import episode_pool
@@ -12,29 +12,41 @@ from envs.supervision import TIMEOUT_S
 
 
 @dataclass(frozen=True, kw_only=True)
-class CauseRun:
-    """Settings of the measurement in one environment."""
+class CauseTask:
+    """Settings of one episode; can be pickled."""
 
     env_id: str
     """Id of the environment."""
     driver: str
     """Name of the driver."""
     checkpoints: tuple[str, ...]
-    """Checkpoints to measure."""
-    episodes: int
-    """Number of episodes; of reactions the largest one."""
+    """Checkpoints to measure; the first one's perception holds for all."""
     seed: int
-    """Seed of the first episode."""
+    """Seed of the episode; of a run, of its first one."""
     max_steps: int
     """Largest length of an episode [policy steps]."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
+
+    def opened(self) -> World:
+        """Returns the world of the episode, reset; a process keeps it for its next one."""
+        world = kept_world(self.env_id, self.driver, self.checkpoints, self.env_kwargs)
+        world.reset(self.seed)
+        return world
+
+
+@dataclass(frozen=True, kw_only=True)
+class CauseRun(CauseTask):
+    """Settings of the measurement in one environment."""
+
+    episodes: int
+    """Number of episodes; of reactions the largest one."""
     workers: int
     """Number of parallel processes."""
     timeout_s: float = TIMEOUT_S
     """Largest time between two steps of an episode [s]."""
     cluster: str | None = None
     """Address of a Ray cluster that plays in place of this machine."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
     def open(self) -> World:
         """Opens the environment, to look at it; no policy is loaded to drive it."""
@@ -52,31 +64,5 @@ class CauseRun:
             number: number of the episode.
             checkpoints: those that fit the environment.
         """
-        return {
-            "env_id": self.env_id, "driver": self.driver, "checkpoints": checkpoints, "seed": self.seed + number,
-            "max_steps": self.max_steps, "env_kwargs": self.env_kwargs,
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class CauseTask:
-    """Settings of one episode; can be pickled."""
-
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints to measure; the first one's perception holds for all."""
-    seed: int
-    """Seed of the episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
-
-    def opened(self) -> World:
-        """Returns the world of the episode, reset; a process keeps it for its next one."""
-        world = kept_world(self.env_id, self.driver, self.checkpoints, self.env_kwargs)
-        world.reset(self.seed)
-        return world
+        own = {field.name: getattr(self, field.name) for field in fields(CauseTask)}
+        return own | {"checkpoints": checkpoints, "seed": self.seed + number}
