@@ -62,6 +62,8 @@ Observe = Literal[
 
 NO_CHECKPOINT: tuple[Observe, ...] = ("none", "constant-velocity")
 """What a policy sees without a checkpoint."""
+_NO_FORECAST: tuple[Observe, ...] = ("zeros", "oracle", "oracle-what-if")
+"""What a policy sees of no checkpoint, though one sets the sizes."""
 Backend = Literal["gymnasium", "envpool"]
 
 
@@ -164,7 +166,11 @@ class Task:
     @property
     def forecaster(self) -> str | None:
         """Value for the argument `checkpoint` of the wrappers."""
-        return CONSTANT_VELOCITY if self.observe == CONSTANT_VELOCITY else self.checkpoint
+        if self.observe == CONSTANT_VELOCITY:
+            return CONSTANT_VELOCITY
+        if self.observe in _NO_FORECAST and self.checkpoint is None and entry_for(self.env_id).checkpoint is None:
+            return self.sizes_of  # whose forecasts are not shown
+        return self.checkpoint
 
     @property
     def make_kwargs(self) -> dict[str, Any]:

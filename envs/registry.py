@@ -212,7 +212,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     except UserError:
         raise
     except (gym.error.Error, ImportError) as error:
-        own = "" if colon else f"give one of your own as module:{env_id}; "
+        own = f"'{module}' has no such function or class, either; " if colon else f"give your own as module:{env_id}; "
         raise UserError(f"cannot make env '{env_id}': {error}; {own}known here: {', '.join(_HIGHWAY)}") from error
     except Exception as error:
         given = {name: value for name, value in kwargs.items() if name not in _OF_GYMNASIUM}
@@ -351,7 +351,7 @@ def checkpoint_for(env_id: str) -> str:
     checkpoint = entry_for(env_id).checkpoint
     if checkpoint is None:
         raise UserError(
-            f"no checkpoint ships for env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
+            f"no checkpoint ships for env '{env_id}'; pass one (--checkpoint NAME or PATH), or 'constant-velocity'. "
             f"Shipped ids: {', '.join((*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS))}"
         )
     return checkpoint

@@ -169,6 +169,8 @@ def check_numbers(observation: Any, reward: Any = 0.0) -> None:
     Raises:
         UserError: one has.
     """
+    if np.ndim(reward):
+        raise UserError(f"the reward must be one number, got an array of shape {np.shape(reward)}")
     if not math.isfinite(float(reward)):
         raise UserError(f"the reward must be a finite number, got {_kind(float(reward))}")
     found = _not_finite(observation)

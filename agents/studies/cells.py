@@ -215,6 +215,9 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
     names, place = tuple(dict.fromkeys(scenario.references)), f"{where}: scenario {scenario.name}"
     try:
         task.check()
+    except UserError as error:
+        raise UserError(f"{place}: {error}") from error
+    try:
         if task.is_multiagent:
             many = task.make()
             many.reset(seed=0)
@@ -226,8 +229,7 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
         said = study.settings_of(scenario)
         return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task), said) for name in names]
     except UserError as error:
-        left_out = f"; references = [] in the study file leaves {', '.join(names)} out" if names else ""
-        raise UserError(f"{place}: {error}{left_out}") from error
+        raise UserError(f"{place}: {error}; references = [] in the study file leaves {', '.join(names)} out") from error
 
 
 def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> list[Cell]:

@@ -333,6 +333,8 @@ def pad_multiagent_scene(
         UserError: more agents than `max_agents`, absent ones, another number of headings, or `full` breaks the
             contract of a scene.
     """
+    if not isinstance(index_of, Mapping):
+        raise UserError(f"{source}: index_of must be a dict from names to indices, got {type(index_of).__name__}")
     full.check(source, spec)
     count = len(full.ids)
     if not full.valid.all():
@@ -340,7 +342,9 @@ def pad_multiagent_scene(
     if np.shape(heading_rad) != (count,):
         raise UserError(f"{source}: {count} agents need as many headings, got shape {np.shape(heading_rad)}")
     if count > spec.max_agents:
-        raise UserError(f"{source}: {count} agents do not fit max_agents={spec.max_agents}; raise max_agents")
+        raise UserError(
+            f"{source}: {count} agents do not fit max_agents={spec.max_agents} of the reader's spec; raise it there"
+        )
     if count == spec.max_agents:
         return MultiagentScene(full, dict(index_of), np.array(heading_rad, dtype=np.float64))
     headings = np.zeros(spec.max_agents)
@@ -349,8 +353,9 @@ def pad_multiagent_scene(
 
 
 def role_of(agent: str) -> str:
-    """Returns an agent's name without its number."""
-    return agent.rstrip("0123456789").rstrip("_- ") or agent
+    """Returns an agent's name without its number; that of an agent whose name is a number is the number."""
+    name = str(agent)
+    return name.rstrip("0123456789").rstrip("_- ") or name
 
 
 def perceive_batch(full: SceneBatch, spec: SceneSpec) -> SceneBatch:

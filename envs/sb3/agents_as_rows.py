@@ -329,6 +329,8 @@ class _Copy:
 
 def _make_copies(factories: Sequence[Callable[[], ParallelEnv]]) -> list[ParallelEnv]:
     """Makes distinct environments with equal agents and spaces."""
+    if not isinstance(factories, Sequence) or not all(map(callable, factories)):
+        raise UserError(f"ParallelVecEnv takes a list of functions that make a copy each, got {short(factories, 100)}")
     envs = [factory() for factory in factories]
     if not envs:
         raise UserError("at least one factory is needed, got none")

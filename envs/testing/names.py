@@ -19,8 +19,9 @@ MOST_AGENTS = 8
 
 
 def name_problems(episodes: Sequence[Episode]) -> list[str]:
-    """Returns a line for an agent that lives and is not named, or whose name goes to another id."""
-    return next((found for episode in episodes if (found := _missing(episode) or _moved(episode))), [])
+    """Returns a line for an agent that is observed and not named, named and gone, or whose name goes to another id."""
+    checks = (_missing, _gone, _unseen, _moved)
+    return next((found for check in checks for episode in episodes if (found := check(episode))), [])
 
 
 def _missing(episode: Episode) -> list[str]:
@@ -32,6 +33,39 @@ def _missing(episode: Episode) -> list[str]:
                 f"index_of must have the index of each agent that lives, but lacks {short(lacks, 100)} {when}; its "
                 f"names are {short([*moment.named], 100)}; the view of an agent without one would be zeros"
             ]
+    return []
+
+
+def _gone(episode: Episode) -> list[str]:
+    """Finds an agent that has ended before and is still named, or ends now and no longer is."""
+    for time, (moment, shown, before) in enumerate(
+        zip(episode.moments[1:], episode.shown[1:], episode.living, strict=False), start=1
+    ):
+        last = [agent for agent in before if agent in shown and agent not in moment.named]
+        if last:
+            return [
+                f"index_of must have each agent that is observed, but lacks {short(last, 90)} in step {time}, its last "
+                "one: that observation would be zeros; env.agents no longer has who ends"
+            ]
+        ended = [agent for agent in moment.named if agent not in shown and agent not in episode.living[time]]
+        if ended:
+            return [
+                f"index_of names {short(ended, 90)} in step {time}, which neither lives nor is observed: leave out who "
+                "has gone, in index_of and in the scene"
+            ]
+    return []
+
+
+def _unseen(episode: Episode) -> list[str]:
+    """Finds an agent that lives and gets no observation, or that acted and gets no reward."""
+    for time, living in enumerate(episode.living):
+        lacks = [agent for agent in living if agent not in episode.shown[time]]
+        if lacks:
+            return [f"the environment gives no observation for {short(lacks, 100)}, alive in step {time}; give one"]
+        if time:
+            lacks = [agent for agent in episode.living[time - 1] if agent not in episode.rewards[time - 1]]
+        if lacks:
+            return [f"the environment gives no reward for {short(lacks, 100)}, who acted in step {time}; give one"]
     return []
 
 
@@ -72,12 +106,13 @@ def _obeyed_by_another(env: Any, opened: OpenReader, seed: int, agent: str) -> s
         if row is None or effect.max() <= ALIKE:
             continue
         obeys = int(effect.argmax())
-        votes.append("" if obeys == row else names.get(int(first.ids[obeys]), f"of id {first.ids[obeys]}"))
+        key = int(first.ids[obeys])
+        votes.append("" if obeys == row else f"'{names[key]}'" if key in names else f"id {key}")
         own, strongest = max(own, effect[row] if row < len(effect) else 0.0), max(strongest, effect.max())
     if len(votes) < 2 or len(set(votes)) > 1 or not votes[0] or own > 0.5 * strongest:
         return ""
     return (
-        f"the actions of '{agent}' move what index_of calls '{votes[0]}', and not '{agent}': each name must have the "
+        f"the actions of '{agent}' move what index_of calls {votes[0]}, and not '{agent}': each name must have the "
         "index of its own agent"
     )
 

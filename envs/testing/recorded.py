@@ -137,8 +137,8 @@ def _no_numbers(episodes: Sequence[Episode]) -> list[str]:
         for agent, reward in rewards.items()
     ):
         found = as_numbers(reward)
-        if found is None or found.size != 1:
-            whose = f" of '{agent}'" if agent else ""
+        if found is None or np.ndim(reward):
+            whose = f" of '{agent}'" if agent != "" else ""
             return [
                 f"the environment's own reward{whose} must be one number, got {short(repr(reward), 60)} in step {time}"
             ]
@@ -152,7 +152,7 @@ def _outside(episodes: Sequence[Episode], spaces: Mapping[str, Any]) -> list[str
             for agent, seen in shown.items():
                 why = _misfit(seen, spaces[agent]) if agent in spaces else f" has no space, named are {list(spaces)}"
                 if why:
-                    whose = f" of '{agent}'" if agent else ""
+                    whose = f" of '{agent}'" if agent != "" else ""
                     return [
                         f"the environment's own observation{whose}{why}, in step {time}: its observation_space must "
                         "hold all that it shows"

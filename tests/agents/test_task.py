@@ -287,6 +287,12 @@ def test_unbounded_perception_is_a_task_of_a_policys_note():
         Task("CartPole-v1", "forecast", checkpoint="constant-velocity", perception_m=-1.0)
 
 
+def test_sizes_serve_an_arm_that_shows_no_forecast_where_no_checkpoint_ships():
+    assert Task("parking-v0", "zeros", sizes_of="highway").forecaster == "highway"
+    assert Task("parking-v0", "single", sizes_of="highway").forecaster is None
+    assert Task("merge-v1", "zeros", sizes_of="highway").forecaster is None, "the one that ships"
+
+
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "simple_tag_v3"])
 def test_the_check_finds_own_entries_that_have_the_name_of_added_ones(env_id: str, monkeypatch: pytest.MonkeyPatch):
     task, space = (

@@ -157,7 +157,7 @@ def test_scenes_are_padded_to_max_agents(tag: ParallelEnv, size: int):
 
 
 def test_too_small_max_agents_are_named(tag: ParallelEnv):
-    with pytest.raises(UserError, match="MpeReader: 6 agents do not fit max_agents=5; raise max_agents"):
+    with pytest.raises(UserError, match="MpeReader: 6 agents do not fit max_agents=5 of the reader's spec"):
         MpeReader(tag, max_agents=5).read(tag)
 
 

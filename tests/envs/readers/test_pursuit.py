@@ -219,7 +219,7 @@ def test_reading_before_the_first_reset_is_a_protocol_error():
 
 def test_too_small_max_agents_are_named():
     env = placed([(4, 2), (6, 2)], [(9, 9)])
-    with pytest.raises(UserError, match="PursuitReader: 3 agents do not fit max_agents=2; raise max_agents"):
+    with pytest.raises(UserError, match="PursuitReader: 3 agents do not fit max_agents=2 of the reader's spec"):
         PursuitReader(env, max_agents=2).read(env)
 
 
