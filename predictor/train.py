@@ -268,6 +268,11 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         return
     if not config.resume:
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
+    if not (config.out / STATE_FILE).exists() and any(p["step"] for p in read_curve(config.out / CURVE_FILE)):
+        raise UserError(
+            f"cannot resume: {config.out} has a curve but no {STATE_FILE}, so that the training would begin anew and "
+            "replace what is there; choose another --out"
+        )
     content = read_object(config_file)
     before = as_object(content.get("config"), f"{config_file}: config")
     now = _comparable(config)

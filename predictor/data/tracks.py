@@ -386,6 +386,10 @@ def main() -> None:
         print(summary(part.config, episodes))
         for doubt in doubts(episodes, notes.counts):
             print(f"warning: {doubt}")
+        labels = {episode.label for episode in episodes}
+        for path in part.chosen:
+            if label_of(path, part.config.source) not in labels:
+                print(f"warning: {path} has no episode: nobody is there in two frames a step apart, from its first on")
     for path in files_beside(config):
         print(f"warning: {path} is in none of the folders {', '.join(FOLDERS)}, and in no store")
 

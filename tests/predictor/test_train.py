@@ -653,6 +653,15 @@ def test_resuming_with_another_store_at_the_same_place_is_refused(circles: Path,
         train(config(circles, tmp_path / "run", resume=True))
 
 
+def test_a_run_without_its_state_is_not_begun_anew(tiny: None, circles: Path, tmp_path: Path):
+    train(config(circles, tmp_path / "run", steps=2))
+    (tmp_path / "run" / "train_state.pt").unlink()
+    curve = (tmp_path / "run" / "curve.json").read_text()
+    with pytest.raises(UserError, match="has a curve but no train_state.pt, so that the training would begin anew"):
+        train(config(circles, tmp_path / "run", steps=4, resume=True))
+    assert (tmp_path / "run" / "curve.json").read_text() == curve
+
+
 def test_a_run_goes_on_wherever_it_and_its_data_are(tiny: None, circles: Path, tmp_path: Path):
     shutil.copytree(circles, tmp_path / "before")
     train(config(tmp_path / "before", tmp_path / "run", steps=2))

@@ -373,6 +373,21 @@ def test_what_is_probably_wrong_is_said(source: Path, walk: Path, loader: Loader
     )
 
 
+def test_a_file_of_which_nothing_is_kept_is_named(
+    source: Path, walk: Path, loader: Loader, capsys: pytest.CaptureFixture[str]
+):
+    """Steps are counted from a file's first frame: one that is early by half a step leaves no other."""
+    stray = walk.with_name(f"stray{walk.suffix}")
+    stray.write_text(text_of([(WALK[0][0] - 5, 99, 0, 0), *WALK]))
+    words = ["tracks", "--source", str(source), "--out", str(loader.store), "--frame-step", "10"]
+    loader.monkeypatch.setattr(sys, "argv", words)
+    tracks.main()
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert any(line.startswith(f"warning: {stray} has no episode: nobody is there in two frames") for line in said), (
+        said
+    )
+
+
 def test_files_without_tracks(source: Path, walk: Path, loader: Loader):
     walk.write_text("# nothing\n\n")
     loader.refuses(source, f"{walk} holds no line of a track; remove the file or choose others with --pattern")
