@@ -29,8 +29,9 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
 
 def program() -> list[str]:
     """Returns the words before the options: "dgvae collect", "python -m module" or "python script"."""
-    if sys.argv[0].startswith("dgvae "):
-        return [sys.argv[0]]
+    first = sys.argv[0] or ""  # None for a module of dgvae_rl that is run by its path below it
+    if first.startswith("dgvae "):
+        return [first]
     return ["python", *_module_or_script()]
 
 

@@ -328,7 +328,7 @@ def test_default_holds_the_most_that_can_come():
 def test_too_small_a_scene_is_named():
     env = HighwayParallelEnv()
     env.reset(seed=0)
-    with pytest.raises(UserError, match="HighwayMultiagentReader: .* agents do not fit max_agents=2; raise max_agents"):
+    with pytest.raises(UserError, match="HighwayMultiagentReader: .* agents do not fit max_agents=2 of the reader"):
         multiagent_reader_for(env, max_agents=2).read(env)
 
 
