@@ -77,8 +77,10 @@ def main() -> None:
         print(one_line(UserError(line)))
     if found.problems:
         sys.exit(1)
-    lasting = "" if found.lasting is None else f"; {found.lasting:.0%} of the others' ids last from step to step"
-    print(f"nothing found in {config.episodes} episodes{lasting}")
+    lasting = f"{found.lasting:.0%} of the others' ids last from step to step" if found.lasting is not None else ""
+    print(
+        f"nothing found in {config.episodes} episodes; {lasting or 'of other agents too little was seen to say more'}"
+    )
 
 
 if __name__ == "__main__":

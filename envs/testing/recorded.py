@@ -89,7 +89,7 @@ def _rounded(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
 
 
 def _unseen(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
-    """Finds environments in which the ego is always alone, or never sees anybody."""
+    """Finds environments in which the ego never sees anybody, though others are there."""
     if not spec.has_ego:
         return []
     axes = spec.position_dim
@@ -99,9 +99,7 @@ def _unseen(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
         for m in episode.moments
         if len(m.states) > 1
     ]
-    if not apart_m:
-        return ["the ego is alone at every step: no other agent is ever there; let read return all agents"]
-    if min(apart_m) <= spec.perception_m:
+    if not apart_m or min(apart_m) <= spec.perception_m:
         return []
     return [
         f"no other agent is ever within perception_m={spec.perception_m:g} m of the ego, the nearest is "

@@ -200,7 +200,6 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "id of the newcomer": (with_ids(lambda ids, _: np.where(ids == 7, 2, ids)), "an id jumps: in step 4 id 2 is "),
     "new ids": (NewIds, "no agent is there in two scenes that follow each other: ids must stay with an agent"),
     "new ids of the others": (NewOthers, "0% of the others' ids are there after a step, too; an id must stay with its"),
-    "alone": (with_rows(lambda scene, _: np.arange(1)), "the ego is alone at every step: no other agent is ever there"),
     "ego not first": (with_rows(lambda scene, _: np.roll(np.arange(len(scene.ids)), 1)), "agent 1 of the scene obeys"),
     "others relative": (
         with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1]])),
