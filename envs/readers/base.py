@@ -120,6 +120,7 @@ def build_reader(make_reader: Any, env: Any) -> Any:
     Raises:
         UserError: it returns no `SceneReader`; the message says what to pass instead.
     """
+    make_reader = load_named(make_reader) if isinstance(make_reader, str) else make_reader
     name = _name_of(make_reader)
     advice = f"for a function that reads a scene, give FunctionReader({name}, SceneSpec(dt_s=...))"
     if isinstance(make_reader, type):
@@ -139,6 +140,7 @@ def build_multiagent_reader(make_reader: Any, env: Any) -> Any:
     Raises:
         UserError: it returns no `MultiagentReader`; the message says what to pass instead.
     """
+    make_reader = load_named(make_reader) if isinstance(make_reader, str) else make_reader
     name = _name_of(make_reader)
     advice = "pass a class with spec (has_ego=False), reset() and read(env) -> MultiagentScene (envs.readers)"
     reader = _build(make_reader, env, advice)
@@ -217,9 +219,6 @@ def _name_of(make_reader: Any) -> str:
 
 def _build(make_reader: Any, env: Any, advice: str) -> Any:
     """Calls `make_reader` and checks what both kinds of reader have in common."""
-    if isinstance(make_reader, str):
-        named, make_reader = make_reader, load_named(make_reader)
-        advice = advice.replace("(str, ", f"({named.partition(':')[2]}, ")
     name = _name_of(make_reader)
     if not callable(make_reader):
         raise UserError(f"reader= takes what makes a reader, a Reader class for example, got an object of {name}")
