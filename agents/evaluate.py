@@ -8,6 +8,7 @@ training and of model selection (`agents.task`). docs/protocol.md defines each m
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -39,7 +40,7 @@ from predictor.support.config_checks import check_at_least, check_at_most, check
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
 from predictor.support.hub import is_hub
-from predictor.support.memory import check_count, check_processes
+from predictor.support.memory import PROCESS_BYTES, check_count
 from predictor.support.progress import WorkShown
 from predictor.support.remote import is_remote
 from predictor.support.runtime import keep_freed_memory, resolve_device
@@ -167,7 +168,7 @@ class EvaluateConfig:
         check_at_least(self, 1, "episodes", "num_envs")
         check_positive(self, "timeout_s")
         check_count(self.episodes, "episodes")
-        check_processes(min(self.num_envs, self.episodes), "num_envs")
+        check_count(min(self.num_envs, self.episodes), "num_envs", PROCESS_BYTES)
         check_at_most(self, MOST_EPISODES, "episodes")
         if (self.run_dir is None) == (self.policy is None):
             raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
@@ -259,9 +260,8 @@ def constant_drivers(task: Task) -> tuple[str, ...]:
     """Returns the drivers that take one action in every step; none without an ego or a few discrete actions."""
     if task.is_multiagent:
         return ()
-    env = task.make(disable_env_checker=True)
-    drivers = tuple(constant_actions(env))
-    env.close()
+    with closing(task.make(disable_env_checker=True)) as env:
+        drivers = tuple(constant_actions(env))
     return drivers if len(drivers) <= MOST_CONSTANTS else ()
 
 
@@ -275,12 +275,11 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
         return ()
     if task.is_multiagent:
         raise UserError(f"drivers of an ego need an environment with one ego, {task.env_id} has several agents")
-    env = task.make(disable_env_checker=True)
-    drivers = named_drivers(names, env)
-    for name in drivers:
-        require_own_view(env, name)
-        make_ego_driver(name, env, np.random.default_rng(0))
-    env.close()
+    with closing(task.make(disable_env_checker=True)) as env:
+        drivers = named_drivers(names, env)
+        for name in drivers:
+            require_own_view(env, name)
+            make_ego_driver(name, env, np.random.default_rng(0))
     return drivers
 
 

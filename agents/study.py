@@ -30,7 +30,7 @@ from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, new_file, write_text
 from predictor.support.jobs import LOG_FILE
 from predictor.support.locks import locked
-from predictor.support.memory import check_processes
+from predictor.support.memory import PROCESS_BYTES, check_count
 from predictor.support.provenance import commit_at_start, provenance
 from predictor.support.stopping import resumable
 
@@ -69,7 +69,7 @@ class StudyConfig:
         """Checks ranges."""
         check_at_least(self, 0, "workers")
         check_at_least(self, 1, "seeds")
-        check_processes(self.workers, "workers")
+        check_count(self.workers, "workers", PROCESS_BYTES)
         check_address(self.cluster)
         if self.report and (self.scenarios or self.seeds is not None or self.cluster is not None):
             raise UserError("--report takes all results in the folder; leave out --scenarios, --seeds and --cluster")

@@ -12,8 +12,6 @@ from envs.rollouts.driving_measures import DrivingMeasures
 
 NEARLY_CONSTANT = 0.95
 """Least share of one action from which on a policy is called nearly constant."""
-NORMAL_95 = 1.959963984540054
-"""Two-sided 95 % quantile of the normal distribution."""
 
 EXTREMES = ("best", "median", "worst")
 """Names of the extreme episodes of a policy, by return; each can be filmed."""

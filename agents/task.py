@@ -5,6 +5,7 @@ import importlib.util
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_type_hints
 
@@ -264,13 +265,10 @@ class Task:
 
     def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
         """Returns an observation space with forecasts, and the layout of the scenes behind them."""
-        env = self.wrapped(self.make())
-        if self.is_multiagent:
-            space, spec = env.observation_space(env.possible_agents[0]), env.scene_spec
-        else:
-            space, spec = env.observation_space, env.get_wrapper_attr("scene_spec")
-        env.close()
-        return space, spec
+        with closing(self.wrapped(self.make())) as env:
+            if self.is_multiagent:
+                return env.observation_space(env.possible_agents[0]), env.scene_spec
+            return env.observation_space, env.get_wrapper_attr("scene_spec")
 
     def check(self) -> tuple[gym.Space, gym.Space]:
         """Makes the environment, with its forecaster, and returns its observation space and its action space.
@@ -280,31 +278,28 @@ class Task:
         """
         if self.is_multiagent:
             return self._check_multiagent()
-        env = self.make()
-        env.close()
-        check_unwrapped(env.observation_space, f"env '{self.env_id}'")
-        _ = self.scene_spec
+        with closing(self.make()) as env:
+            check_unwrapped(env.observation_space, f"env '{self.env_id}'")
+        if self.observe != "none":
+            self._forecasts()
         return env.observation_space, env.action_space
 
     def _check_multiagent(self) -> tuple[gym.Space, gym.Space]:
-        env = self.make()
-        for agent in env.possible_agents:
-            check_unwrapped(env.observation_space(agent), f"'{agent}' of {self.env_id}")
-        if self.observe != "none":
-            env = self.wrapped(env)
-        learners = learners_named(env.possible_agents, self.learners, self.env_id)
-        has_others = len(learners) < len(env.possible_agents)
-        if has_others:
-            make_driver(self.driver, env, np.random.default_rng(0))
-        elif self.learners and self.driver != type(self).driver:
-            env.close()
-            raise UserError(
-                f"driver drives the agents that do not learn, and all of {self.env_id} do; name fewer learners, or "
-                "leave driver out"
-            )
-        rows = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None)
-        env.close()
-        return rows.observation_space, rows.action_space
+        with closing(self.make()) as own:
+            for agent in own.possible_agents:
+                check_unwrapped(own.observation_space(agent), f"'{agent}' of {self.env_id}")
+            env = own if self.observe == "none" else self.wrapped(own)
+            learners = learners_named(env.possible_agents, self.learners, self.env_id)
+            has_others = len(learners) < len(env.possible_agents)
+            if has_others:
+                make_driver(self.driver, env, np.random.default_rng(0))
+            elif self.learners and self.driver != type(self).driver:
+                raise UserError(
+                    f"driver drives the agents that do not learn, and all of {self.env_id} do; name fewer learners, or "
+                    "leave driver out"
+                )
+            rows = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None)
+            return rows.observation_space, rows.action_space
 
 
 _OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",

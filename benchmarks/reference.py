@@ -22,6 +22,7 @@ from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, ratio_line, timed_line
 from predictor.dgvae.config import DGVAEConfig
 from predictor.support.errors import UserError
+from predictor.support.runtime import float32_products
 
 EQUAL = DGVAEConfig(
     hidden_dim=256, rnn_dim=64, head_dim=128, message_dim=256, decoder_dim=256, edge_feature_dim=32, zero_start=True
@@ -205,12 +206,8 @@ def as_shipped(call: Callable[[], Any]) -> Callable[[], Any]:
     """Returns a function that makes the call with torch's default precision of matrix products."""
 
     def untuned() -> Any:
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("highest")
-        try:
+        with float32_products("highest"):
             return call()
-        finally:
-            torch.set_float32_matmul_precision(before)
 
     return untuned
 

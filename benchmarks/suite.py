@@ -1,18 +1,17 @@
 """Runs sections and reports a run: lines, machine, versions."""
 
+import contextlib
 import importlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
-
-import torch
 
 from benchmarks.compare import Baseline, Comparison, better_of, compare
 from benchmarks.optional_packages import missing
 from benchmarks.results import Line, skipped
 from benchmarks.settings import SECTIONS, Settings
 from predictor.support.provenance import provenance
-from predictor.support.runtime import processor
+from predictor.support.runtime import float32_products, processor
 
 NEEDED: dict[str, tuple[str, ...]] = {
     "wrappers": ("gymnasium", "highway_env", "stable_baselines3"),
@@ -44,15 +43,8 @@ WITH_POLICIES = {"wrappers", "ppo"}
 
 def _run(section: str, settings: Settings) -> list[Line]:
     module: Any = importlib.import_module(SECTIONS[section])
-    if section not in WITH_POLICIES:
+    with float32_products("highest") if section in WITH_POLICIES else contextlib.nullcontext():
         lines: list[Line] = module.run(settings)
-        return lines
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
-    try:
-        lines = module.run(settings)
-    finally:
-        torch.set_float32_matmul_precision(before)
     return lines
 
 

@@ -4,7 +4,6 @@ Each episode is a function of its seed and the options alone, so the store is th
 recording that is stopped goes on where it stopped when its command is repeated.
 """
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,10 +14,10 @@ from typing import Any, ClassVar, NamedTuple
 from envs.drivers.content import content_of, content_of_module
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
 from envs.registry import arguments_of
-from envs.rollouts.branch_recording import branch_mix_for
+from envs.rollouts.branch_recording import BranchRecording, branch_mix_for
 from envs.rollouts.causal_labels import TRIED, settings_for
 from envs.rollouts.cluster_pool import episode_pool
-from envs.rollouts.interventions import kinds_of
+from envs.rollouts.kept_world import kept_world
 from envs.rollouts.perturbations import check_kinds, mix_for
 from envs.rollouts.recording import Recording, record_all
 from envs.rollouts.workers import EpisodePool, Failed, OnError
@@ -34,7 +33,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_at_most, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.locks import locked_path
-from predictor.support.memory import check_count, check_processes
+from predictor.support.memory import PROCESS_BYTES, check_count
 from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
 from predictor.support.remote import address, is_remote
@@ -129,7 +128,7 @@ class CollectConfig:
         check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers", "branch_history_steps")
         check_at_least(self, 0, "seed", "causal_labels", "branches")
         check_count(self.episodes, "episodes")
-        check_processes(min(self.workers, self.episodes), "workers")
+        check_count(min(self.workers, self.episodes), "workers", PROCESS_BYTES)
         check_address(self.cluster)
         check_positive(self, "causal_horizon_s", "causal_threshold_m", "timeout_s")
         check_at_most(self, MOST_CAUSAL_S, "causal_horizon_s")
@@ -214,18 +213,20 @@ def recording_of(config: CollectConfig) -> Recording:
     given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     causal = replace(settings_for(world), senders=config.causal_senders, **changes)
-    most_s = branch_mix_for(world).horizon_s if config.branches else math.inf
-    if causal.horizon_s > most_s:
-        raise UserError(f"a branch is played for {most_s:g} s, got causal_horizon_s {causal.horizon_s:g}; lower it")
+    if config.branches:
+        mix = branch_mix_for(world)
+        if causal.horizon_s > mix.horizon_s:
+            raise UserError(
+                f"a branch is played for {mix.horizon_s:g} s, got causal_horizon_s {causal.horizon_s:g}; lower it"
+            )
+        branches = BranchRecording(config.branches, config.branch_history_steps, mix, causal, config.twins)
+        return replace(plain, causal=causal, branches=branches)
     return replace(
         plain,
         perturb=config.perturb,
         perturb_kinds=config.perturb_kinds,
         causal_every=config.causal_labels,
-        causal=causal if config.causal_labels or config.branches else None,
-        branches=config.branches,
-        branch_history_steps=config.branch_history_steps,
-        twins=config.twins,
+        causal=causal if config.causal_labels else None,
     )
 
 
@@ -237,26 +238,13 @@ class _Task(NamedTuple):
     env_kwargs: str
 
 
-_worlds: dict[tuple[str, str, str], World] = {}
-"""World of this process, by id, arguments and policy; at most one, since some simulators allow no second."""
-
-
 def _world(env_id: str, driver: str, env_kwargs: str) -> World:
     """Returns the world of this process, with a driver; a new one for another environment or policy."""
-    policy = driver if driver.endswith(".zip") else ""
-    wanted = (env_id, env_kwargs, policy)
-    if wanted not in _worlds:
-        close_world()
-        _worlds[wanted] = open_world(env_id, driver, env_kwargs=env_kwargs)
-    elif not policy:
-        _worlds[wanted].drive(driver)
-    return _worlds[wanted]
-
-
-def close_world() -> None:
-    """Closes the world of this process."""
-    while _worlds:
-        _worlds.popitem()[1].close()
+    if driver.endswith(".zip"):
+        return kept_world((env_id, env_kwargs, driver), lambda: open_world(env_id, driver, env_kwargs=env_kwargs))
+    world = kept_world((env_id, env_kwargs), lambda: open_world(env_id, driver, env_kwargs=env_kwargs))
+    world.drive(driver)
+    return world
 
 
 def _record(task: _Task) -> list[Episode]:
@@ -309,7 +297,7 @@ def _info(config: CollectConfig, seed: int) -> StoreInfo:
         made["env_kwargs"] = config.env_kwargs
     if config.perturb:
         kinds = check_kinds(world, config.perturb_kinds)
-        made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(kinds_of(world)))}
+        made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(world))}
     if recording.causal is not None:
         made["causal_labels"] = {"every": config.causal_labels, "tried": TRIED} | asdict(recording.causal)
     if config.branches:

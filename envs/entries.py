@@ -161,8 +161,8 @@ def path_entries(
 def what_if_entries(
     scenes: SceneBatch,
     forecast: Forecast,
-    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0),
-    dt_s: float = 1.0,
+    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"],
+    dt_s: float,
 ) -> dict[str, NDArray[np.float32]]:
     """Returns what a forecast with plans says of the ego and each other agent of this size, agents as in `ego_entries`.
 

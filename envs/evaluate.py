@@ -33,7 +33,7 @@ from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.summary import summarise_episodes
-from envs.rollouts.world import default_drivers, open_world
+from envs.rollouts.world import default_drivers, open_to_look, open_world
 from envs.supervision import TIMEOUT_S, EnvironmentFailedError
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, names_of, require_known, resolve
 from predictor.data.store import read_info_of, read_store
@@ -44,7 +44,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, write_json, write_text
-from predictor.support.memory import check_count, check_processes
+from predictor.support.memory import PROCESS_BYTES, check_count
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
@@ -148,7 +148,8 @@ class EvaluateConfig:
         for name in ("episodes", "num_samples"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
-        check_processes(min(self.workers, self.most_episodes if self.reactions else self.episodes), "workers")
+        processes = min(self.workers, self.most_episodes if self.reactions else self.episodes)
+        check_count(processes, "workers", PROCESS_BYTES)
         check_address(self.cluster)
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:
@@ -160,6 +161,10 @@ class EvaluateConfig:
         for name, measurements in USED_BY.items():
             if getattr(self, name) != getattr(type(self), name) and not asked & measurements:
                 raise UserError(f"{name} has no effect on {' and '.join(sorted(asked))}; leave it out")
+
+    def driver_of(self, env_id: str) -> str:
+        """Returns the driver in an environment: the given one, or the first of its own."""
+        return self.driver or default_drivers(env_id, self.env_kwargs)[0]
 
 
 def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:
@@ -176,19 +181,18 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
     Raises:
         UserError: unknown env or checkpoint, or episodes shorter than the horizon.
     """
-    given, names = checkpoint, names_of(config.checkpoint)
-    checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
-    if checkpoint != CONSTANT_VELOCITY and not is_own(checkpoint):
-        checkpoint = str(resolve(checkpoint))
-    driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
-    world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps, env_kwargs=config.env_kwargs)
+    chosen = checkpoint if checkpoint is not None else checkpoint_for(env_id)
+    if chosen != CONSTANT_VELOCITY and not is_own(chosen):
+        chosen = str(resolve(chosen))
+    driver = config.driver_of(env_id)
+    world = open_world(env_id, driver, chosen, horizon_steps=config.horizon_steps, env_kwargs=config.env_kwargs)
     spec = world.spec
     world.close()
-    horizon = config.horizon_steps or load_forecaster(checkpoint, spec, f"env '{env_id}'").horizon_steps
-    episodes = _play_all(config, env_id, checkpoint, driver, horizon)
+    horizon = config.horizon_steps or load_forecaster(chosen, spec, f"env '{env_id}'").horizon_steps
+    episodes = _play_all(config, env_id, chosen, driver, horizon)
     result = summarise_episodes(
-        env_id, checkpoint, driver, spec, episodes, config.memory_steps, config.miss_m,
-        None if given is None else names.get(given), config.env_kwargs,
+        env_id, chosen, driver, spec, episodes, config.memory_steps, config.miss_m,
+        None if checkpoint is None else names_of(config.checkpoint).get(checkpoint), config.env_kwargs,
     )  # fmt: skip
     if not result.model.agents:
         if config.max_steps < horizon:
@@ -205,7 +209,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
 
 
 def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, horizon: int) -> list[Episode]:
-    stores = _stores_of(config.data, env_id, config.env_kwargs)
+    stores = _stores_of(config, env_id)
     tasks = [
         EpisodeTask(
             env_id, checkpoint, driver, config.seed + i, config.num_samples, horizon, config.max_steps,
@@ -217,21 +221,21 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
         return list(track(pool.results(tasks), f"evaluate {env_id}", total=len(tasks)))
 
 
-def _stores_of(roots: Sequence[Path], env_id: str, env_kwargs: str = "") -> tuple[str, ...]:
+def _stores_of(config: EvaluateConfig, env_id: str) -> tuple[str, ...]:
     """Returns the stores that were recorded in this environment, with these arguments."""
     found = []
-    for root in roots:
+    for root in config.data:
         store = root / env_id if (root / env_id).is_dir() else root
         if store == root and not (root / "zarr.json").exists() and any(root.glob("*/zarr.json")):
             continue  # a folder of other environments' stores
         info = read_info_of(store)
-        recorded = info.provenance.get("env_kwargs", "")
-        if info.source == env_id and arguments_of(str(recorded)) == arguments_of(env_kwargs):
+        recorded = arguments_of(str(info.provenance.get("env_kwargs", "")))
+        if info.source == env_id and recorded == arguments_of(config.env_kwargs):
             found.append(str(store))
-    if roots and not found:
+    if config.data and not found:
         raise UserError(
-            f"data: no store of {name_with(env_id, env_kwargs)} in {', '.join(map(str, roots))}; record one with "
-            "python -m envs.collect"
+            f"data: no store of {name_with(env_id, config.env_kwargs)} in {', '.join(map(str, config.data))}; record "
+            "one with python -m envs.collect"
         )
     return tuple(found)
 
@@ -239,8 +243,7 @@ def _stores_of(roots: Sequence[Path], env_id: str, env_kwargs: str = "") -> tupl
 def _check_unseen(stores: Sequence[str], seed: int, episodes: int) -> None:
     """Raises a `UserError` if a store has an episode of a seed that is evaluated."""
     for store in stores:
-        both = {e.seed for e in read_store(Path(store)).episodes} & set(range(seed, seed + episodes))
-        if both:
+        if both := {e.seed for e in read_store(Path(store)).episodes} & set(range(seed, seed + episodes)):
             raise UserError(
                 f"data: {store} has episodes of {len(both)} of the seeds that are evaluated (the first: {min(both)}); "
                 "its controls would know the answers; give another --seed, or another store"
@@ -256,7 +259,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:  # an error for all checkpoints, before hours of work
-        _check_unseen(_stores_of(config.data, env_id, config.env_kwargs), config.seed, config.episodes)
+        _check_unseen(_stores_of(config, env_id), config.seed, config.episodes)
     for env_id in config.env_ids:
         for checkpoint in config.checkpoint or (None,):
             try:
@@ -296,23 +299,22 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
     Raises:
         UserError: an environment cannot be perturbed or copied, or no checkpoint fits it.
     """
-    drivers = {env_id: config.driver or default_drivers(env_id, config.env_kwargs)[0] for env_id in config.env_ids}
+    drivers = {env_id: config.driver_of(env_id) for env_id in config.env_ids}
     for env_id, driver in drivers.items():  # raises before hours of work
         if config.reactions or config.graph:
-            check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
+            check_can_branch(env_id, driver, config.env_kwargs)
         if config.plans:
-            check_has_plans(env_id, config.env_kwargs, driver)
+            check_has_plans(env_id, driver, config.env_kwargs)
     shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
     if config.reactions:
         for env_id in drivers:
-            stores = _stores_of(config.data, env_id, config.env_kwargs)
-            _check_unseen(stores, config.seed, config.most_episodes)
+            _check_unseen(_stores_of(config, env_id), config.seed, config.most_episodes)
         runs = [
             ReactionRun(
                 **settings | {"episodes": config.most_episodes},
                 perturbations=config.perturbations,
                 horizon_steps=config.horizon_steps,
-                stores=_stores_of(config.data, settings["env_id"], config.env_kwargs),
+                stores=_stores_of(config, settings["env_id"]),
             )
             for settings in shared
         ]
@@ -370,9 +372,7 @@ def main() -> None:
     if config.out is not None:
         check_out(config.out)
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
-        policy = config.driver is not None and config.driver.endswith(".zip")
-        driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
-        world = open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs)
+        world = open_to_look(env_id, config.driver_of(env_id), config.env_kwargs)
         world.close()
         # what does not fit is an error; of several, it is noted
         if len(config.checkpoint) < 2 and (config.checkpoint or not causes):

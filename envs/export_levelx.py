@@ -8,6 +8,7 @@ simulator's own. Accelerations are backward differences of the velocity, zero in
 
 import csv
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,10 +92,10 @@ def export_env(env_id: str) -> gym.Env:
     Raises:
         UserError: not a highway-env environment, or policy steps that are not whole frames.
     """
-    env = make_env(env_id, disable_env_checker=True)
-    if not is_highway_env(env):
-        raise UserError(f"exports need a highway-env environment, got {env.unwrapped.__class__.__name__}")
-    policy_hz = env.unwrapped.config["policy_frequency"]  # type: ignore[attr-defined]
+    with closing(make_env(env_id, disable_env_checker=True)) as env:
+        if not is_highway_env(env):
+            raise UserError(f"exports need a highway-env environment, got {env.unwrapped.__class__.__name__}")
+        policy_hz = env.unwrapped.config["policy_frequency"]  # type: ignore[attr-defined]
     if FRAMES_PER_S % policy_hz:
         raise UserError(
             f"policy steps must be whole frames of 1/{FRAMES_PER_S} s, but '{env_id}' has {policy_hz} per s"
@@ -201,10 +202,9 @@ def export(config: ExportConfig) -> int:
         UserError: the environment or the driver does not fit, or `out` exists.
     """
     config.check_out()
-    env = export_env(config.env_id)
-    make_ego_driver(config.driver, env, np.random.default_rng(0))
     frames = 0
-    with new_folder(config.out) as partial:
+    with closing(export_env(config.env_id)) as env, new_folder(config.out) as partial:
+        make_ego_driver(config.driver, env, np.random.default_rng(0))
         for i in track(range(config.episodes), f"export {config.env_id}"):
             episode, heading_rad = roll_out(env, config.driver, config.seed + i, config.max_steps)
             ego: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]

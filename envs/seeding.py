@@ -7,35 +7,29 @@ random interventions, the choice of the steps that get causal labels, branches, 
 and the steps at which plans are played, whatever the number of drivers.
 """
 
+from enum import IntEnum
+
 import numpy as np
 
-_PERTURBATIONS, _LABELS, _BRANCHES, _REACTIONS, _PLANS = (2**16 + i for i in range(5))
-"""Numbers of the children for what is not a driver; drivers have the first ones."""
+
+class Purpose(IntEnum):
+    """What is drawn for an episode beside its drivers; the numbers of the children, of which drivers have the first."""
+
+    PERTURBATIONS = 2**16
+    """Random interventions."""
+    LABELS = 2**16 + 1
+    """Steps with causal labels."""
+    BRANCHES = 2**16 + 2
+    """Moments and interventions of branches."""
+    REACTIONS = 2**16 + 3
+    """Steps and agents at which reactions are measured."""
+    PLANS = 2**16 + 4
+    """Steps at which what-if forecasts are measured."""
 
 
-def perturbation_rng(seed: int) -> np.random.Generator:
-    """Returns the generator of an episode's random interventions."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PERTURBATIONS,)))
-
-
-def label_rng(seed: int) -> np.random.Generator:
-    """Returns the generator that chooses an episode's steps with causal labels."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_LABELS,)))
-
-
-def branch_rng(seed: int) -> np.random.Generator:
-    """Returns the generator of the moments and interventions of an episode's branches."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCHES,)))
-
-
-def reaction_rng(seed: int) -> np.random.Generator:
-    """Returns the generator that chooses an episode's steps and agents at which reactions are measured."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_REACTIONS,)))
-
-
-def plan_rng(seed: int) -> np.random.Generator:
-    """Returns the generator that chooses an episode's steps at which what-if forecasts are measured."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PLANS,)))
+def episode_rng(seed: int, purpose: Purpose) -> np.random.Generator:
+    """Returns the generator of one purpose in the episode of a seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose),)))
 
 
 def driver_rng(seed: int | None, group: int = 0) -> np.random.Generator:

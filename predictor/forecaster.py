@@ -87,17 +87,13 @@ class Memory:
         senders = None if self.senders is None else pad(self.senders, 1, NO_AGENT)
         return Memory(tuple(pad(m, 1) for m in self.nodes), pairs, senders)
 
-    def select(self, envs: Int[Tensor, " envs"]) -> "Memory":
-        """Returns the memory of the given environments."""
+    def select(self, envs: Int[Tensor, " envs"] | slice) -> "Memory":
+        """Returns the memory of the given environments; of a slice without copying it."""
         return self._map(lambda m: m[envs])
 
     def replace_envs(self, envs: Int[Tensor, " envs"], other: "Memory") -> "Memory":
         """Returns a copy in which the memory of `envs` is that of `other`."""
         return self._map(lambda m, o: m.index_copy(0, envs, o), other)
-
-    def part(self, envs: slice) -> "Memory":
-        """Returns the memory of consecutive environments, without copying it."""
-        return self._map(lambda m: m[envs])
 
     @staticmethod
     def concatenate(first: "Memory", *others: "Memory") -> "Memory":

@@ -22,7 +22,14 @@ from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise, check_noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
-from predictor.scene_checks import check_batch, check_ids, check_request, check_states, chosen_envs
+from predictor.scene_checks import (
+    check_batch,
+    check_ids,
+    check_request,
+    check_resolution,
+    check_states,
+    chosen_envs,
+)
 from predictor.support.errors import ProtocolError, UserError
 from predictor.support.runtime import resolve_device
 from predictor.what_if import check_plans, rollout_plans
@@ -111,8 +118,8 @@ class OnlineForecaster:
         """Observes one scene per environment, or one for each of `envs`; the next `forecast` has as many entries.
 
         Raises:
-            UserError: the batch has another shape or type, states that are not finite, or an id twice in a scene; an
-                environment that is not there, or one twice.
+            UserError: the batch has another shape or type, states that are not finite or too far from zero for float32,
+                or an id twice in a scene; an environment that is not there, or one twice.
         """
         use_one_thread_after_fork()
         envs = None if envs is None else chosen_envs(envs, len(self._ids))
@@ -292,7 +299,8 @@ class OnlineForecaster:
         # Columns beyond the last agent of any scene cost nothing: pairs grow with the square of the columns.
         agents = 1 + int(np.flatnonzero(scenes.valid.any(axis=0)).max(initial=0))
         taken = [
-            self._take_part(scenes[part], old_ids[part], memory.part(part), agents) for part in self._parts(len(scenes))
+            self._take_part(scenes[part], old_ids[part], memory.select(part), agents)
+            for part in self._parts(len(scenes))
         ]
         self._beliefs = [part.belief for part in taken]
         self._origins = np.concatenate([part.origins for part in taken])
@@ -321,7 +329,9 @@ class OnlineForecaster:
             )
         origins = local[:, 0, :axes] * self._ego_axes
         local[..., :axes] -= origins[:, None]
-        states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)
+        local = np.where(valid[..., None], local, 0.0)
+        check_resolution(local, self.forecaster.spec, "states of scenes")
+        states = torch.from_numpy(local.astype(np.float32)).to(self.device)
         observed: Any = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
         check_observed(observed, states, self.forecaster)
         memory, belief = observed

@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.scene import LARGEST, PADDING_ID, SceneBatch
+from predictor.scene import LARGEST, PADDING_ID, SceneBatch, SceneSpec
 from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 
+COARSEST = 5e-4
+"""Largest distance between neighbouring numbers of float32 at positions, as a share of their scale."""
 MOST_STEPS = 100_000
 """Largest number of steps of a forecast."""
 _KINDS = {
@@ -54,6 +56,28 @@ def check_states(states: Float[np.ndarray, "envs agents state"]) -> None:
         scene, agent, _ = np.argwhere(~(np.abs(states) <= LARGEST))[0].tolist()
         wanted = f"at most {LARGEST:g} in size" if np.isfinite(states).all() else "finite"
         raise UserError(f"states must be {wanted}, got {states[scene, agent].tolist()} (scene {scene}, agent {agent})")
+
+
+def check_resolution(states: Float[np.ndarray, "... state"], spec: SceneSpec, where: str) -> None:
+    """Checks that float32 keeps positions well enough for motion to be seen in them: not those of a country's map.
+
+    Args:
+        states: states, zeros where no agent is.
+        spec: layout of the states.
+        where: what they are of, for the message.
+
+    Raises:
+        UserError: they are too far from zero.
+    """
+    farthest = np.abs(states[..., : spec.position_dim]).max(axis=tuple(range(states.ndim - 1)), initial=0.0)
+    step = np.spacing(farthest.astype(np.float32))
+    share = step / np.asarray(spec.feature_scales[: spec.position_dim])
+    if (share > COARSEST).any():
+        axis = int(share.argmax())
+        raise UserError(
+            f"{where}: {spec.feature_names[axis]} lies up to {farthest[axis]:.8g} from zero, where float32 has steps "
+            f"of {step[axis]:.2g}; subtract one fixed point of the map from all positions"
+        )
 
 
 def check_ids(ids: Int[np.ndarray, "envs agents"], valid: Bool[np.ndarray, "envs agents"]) -> None:

@@ -34,7 +34,7 @@ from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import finite, write_json, write_text
 from predictor.support.jobs import run_tasks
 from predictor.support.locks import locked
-from predictor.support.memory import check_count, check_processes
+from predictor.support.memory import PROCESS_BYTES, check_count
 from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
@@ -106,7 +106,7 @@ class SuiteConfig:
         check_at_least(self, 0, "steps", "workers", "seed")
         check_at_least(self, 1, "seeds")
         check_count(self.seeds, "seeds")
-        check_processes(self.workers, "workers")
+        check_count(self.workers, "workers", PROCESS_BYTES)
         check_address(self.cluster)
         keys = [line.key for line in TABLES[self.table].lines]
         for key in self.lines:

@@ -286,11 +286,6 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--steps -1", "steps must not be negative, got -1"),
         ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
-    "benchmarks.churn": [
-        ("--out .", FOLDER),
-        ("--num-envs 0", "num_envs must be at least 1, got 0"),
-        ("--checkpoint absent", "no checkpoint 'absent'"),
-    ],
     "benchmarks.envpool_identity": [("--num-envs 0", "num_envs must be at least 1, got 0")],
     "benchmarks.envpool_parity": [
         ("--task-ids Nope-v0", "cannot compare Nope-v0: unknown"),

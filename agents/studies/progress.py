@@ -52,7 +52,7 @@ class Progress:
     def _say(self, text: str) -> None:
         line = f"{datetime.datetime.now():%H:%M:%S} {text}"
         print(line, flush=True)
-        with self._log.open("a") as log:
+        with self._log.open("a", encoding="utf-8") as log:
             log.write(line + "\n")
 
 

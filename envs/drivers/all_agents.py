@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.drivers.own import OwnDriver
-from envs.drivers.sampled_actions import first_action, uniform_action, varied_actions
 from envs.readers import multiagent_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.pursuit import is_pursuit_env
+from envs.sampled_actions import first_action, uniform_action, varied_actions
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 

@@ -14,8 +14,8 @@ from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.own import OwnDriver
 from envs.drivers.planner import PLANNER, is_planner, planner_driver
-from envs.drivers.sampled_actions import first_action, uniform_action, varied_actions
 from envs.drivers.trained import EgoDriver, trained_ego
+from envs.sampled_actions import first_action, uniform_action, varied_actions
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 

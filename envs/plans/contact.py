@@ -55,8 +55,8 @@ class Contacts(NamedTuple):
 def contacts(
     forecast: Forecast,
     scenes: SceneBatch,
-    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0),
-    dt_s: float = 1.0,
+    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"],
+    dt_s: float,
 ) -> Contacts:
     """Computes the contacts of the ego with the other agents of each scene.
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from envs.rollouts.branches import Branch, Branches, BranchPoint, copied
 from envs.rollouts.causal_labels import CausalSettings, direct_shift_m, farthest, senders_of
-from envs.rollouts.interventions import kinds_of
+from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.world import World
-from envs.seeding import branch_rng
+from envs.seeding import Purpose, episode_rng
 from envs.simulators.interventions import Intervention, Kind
 from envs.supervision import EnvironmentFailedError
 from predictor.data.store import PERTURBATIONS, Episode
@@ -77,7 +77,7 @@ def branch_mix_for(world: World) -> BranchMix:
     Raises:
         UserError: the world cannot be perturbed.
     """
-    return ON_ROADS if "left" in kinds_of(world) else IN_ARENAS
+    return ON_ROADS if is_on_roads(world) else IN_ARENAS
 
 
 def record_branches(world: World, seed: int, label: str, max_steps: int, settings: BranchRecording) -> list[Episode]:
@@ -95,7 +95,7 @@ def record_branches(world: World, seed: int, label: str, max_steps: int, setting
     Raises:
         UserError: the world cannot be copied or perturbed.
     """
-    rng = branch_rng(seed)
+    rng = episode_rng(seed, Purpose.BRANCHES)
     scenes, moments = _play(world, seed, max_steps, settings.branches, rng)
     found = []
     for step, moment in moments:

@@ -17,6 +17,7 @@ True
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Bool, Float, Int
 
 from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of, knows_bodies
-from envs.rollouts.world import EgoWorld, World, open_world
+from envs.rollouts.world import EgoWorld, World, open_to_look
 from envs.simulators.copies import running_copy
 from envs.simulators.interventions import Intervention, log_motion, simulator_of
 from predictor.scene import Scene
@@ -162,11 +163,8 @@ def check_can_branch(env_id: str, driver: str, env_kwargs: str = "") -> None:
     Raises:
         UserError: they cannot, or the environment or the driver is unknown.
     """
-    world = open_world(env_id, driver, env_kwargs=env_kwargs)
-    try:
+    with closing(open_to_look(env_id, driver, env_kwargs)) as world:
         kinds_of(world)
-    finally:
-        world.close()
 
 
 def copied(world: World) -> World:

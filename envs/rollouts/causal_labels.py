@@ -23,10 +23,11 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint, copied
-from envs.rollouts.interventions import intervene, interventions_of, kinds_of
+from envs.rollouts.interventions import intervene, interventions_of, is_on_roads, kinds_of
 from envs.rollouts.world import World
 from envs.simulators.interventions import Intervention, Kind
 from envs.simulators.stand_in import seat_driver
+from envs.supervision import EnvironmentFailedError
 from predictor.data.store import Episode
 from predictor.support.errors import UserError
 
@@ -60,7 +61,7 @@ def settings_for(world: World) -> CausalSettings:
     Raises:
         UserError: the world cannot be perturbed.
     """
-    return ON_ROADS if "left" in kinds_of(world) else IN_ARENAS
+    return ON_ROADS if is_on_roads(world) else IN_ARENAS
 
 
 @dataclass(frozen=True)
@@ -174,12 +175,19 @@ def _candidates(world: World, settings: CausalSettings) -> list[int]:
 
 
 def possible(world: World, agent: int, steps: int) -> list[Intervention]:
-    """Returns what can be tried on an agent: nothing if it does not move by itself or is under an intervention."""
+    """Returns what can be tried on an agent: nothing if it does not move by itself or is under an intervention.
+
+    Raises:
+        UserError: the world cannot be copied or perturbed.
+    """
+    kinds_of(world)
     found = []
     for kind in TRIED:
-        intervention = Intervention(agent, kind, steps)
+        intervention, beside = Intervention(agent, kind, steps), copied(world)
         try:
-            intervene(copied(world), intervention)
+            intervene(beside, intervention)
+        except EnvironmentFailedError:
+            raise
         except UserError:
             continue
         found.append(intervention)

@@ -20,7 +20,7 @@ from envs.rollouts.cause_run import CauseTask
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
-from envs.seeding import label_rng
+from envs.seeding import Purpose, episode_rng
 from predictor.evaluation.pair_trees import pair_features
 
 EVERY = 5
@@ -63,7 +63,7 @@ def play_graph(task: GraphTask) -> list[EdgeScene]:
     world = task.opened()
     found = checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
     forecasters = {name: SideForecaster(forecaster, world.spec, 1) for name, forecaster in found.items()}
-    first = int(label_rng(task.seed).integers(EVERY))
+    first = int(episode_rng(task.seed, Purpose.LABELS).integers(EVERY))
     scenes = []
     for step in range(task.max_steps):
         for forecaster in forecasters.values():

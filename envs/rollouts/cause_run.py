@@ -5,9 +5,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from envs.rollouts.cluster_pool import episode_pool
-from envs.rollouts.side_forecasts import kept_world
+from envs.rollouts.kept_world import kept_world
+from envs.rollouts.side_forecasts import open_for_checkpoints
 from envs.rollouts.workers import EpisodePool, Result
-from envs.rollouts.world import World, open_world
+from envs.rollouts.world import World, open_to_look
 from envs.supervision import TIMEOUT_S
 
 
@@ -30,7 +31,8 @@ class CauseTask:
 
     def opened(self) -> World:
         """Returns the world of the episode, reset; a process keeps it for its next one."""
-        world = kept_world(self.env_id, self.driver, self.checkpoints, self.env_kwargs)
+        wanted = self.env_id, self.driver, self.checkpoints, self.env_kwargs
+        world = kept_world(wanted, lambda: open_for_checkpoints(*wanted))
         world.reset(self.seed)
         return world
 
@@ -50,8 +52,7 @@ class CauseRun(CauseTask):
 
     def open(self) -> World:
         """Opens the environment, to look at it; no policy is loaded to drive it."""
-        driver = self.driver if not self.driver.endswith(".zip") else "idle"
-        return open_world(self.env_id, driver, env_kwargs=self.env_kwargs)
+        return open_to_look(self.env_id, self.driver, self.env_kwargs)
 
     def pool(self, play: Callable[[Any], Result]) -> EpisodePool[Result]:
         """Returns the processes that play this measurement's tasks; a context manager."""

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastStream
 from envs.readers.highway_labels import SceneLabels
+from envs.rollouts.kept_world import kept_world
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.side_forecasts import SideForecaster, kept_forecaster
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
@@ -150,13 +151,13 @@ def play(task: EpisodeTask) -> Episode:
     return episode
 
 
-@functools.lru_cache(maxsize=4)
-def _kept_world(env_id: str, driver: str, checkpoint: str, horizon_steps: int, env_kwargs: str) -> World:
-    return open_world(env_id, driver, checkpoint, horizon_steps=horizon_steps, env_kwargs=env_kwargs)
-
-
 def _world(task: EpisodeTask) -> World:
-    return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps, task.env_kwargs)
+    """Returns the world of the episode, with forecasts; a process keeps it for its next one."""
+    horizon, kwargs = task.horizon_steps, task.env_kwargs
+    return kept_world(
+        (task.env_id, task.driver, task.checkpoint, horizon, kwargs),
+        lambda: open_world(task.env_id, task.driver, task.checkpoint, horizon_steps=horizon, env_kwargs=kwargs),
+    )
 
 
 @functools.lru_cache(maxsize=2)

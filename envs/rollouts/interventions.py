@@ -51,6 +51,15 @@ def kinds_of(world: World) -> tuple[Kind, ...]:
     return kinds
 
 
+def is_on_roads(world: World) -> bool:
+    """Returns whether agents drive in lanes (highway-env); else they move freely at about 1 m/s (mpe2).
+
+    Raises:
+        UserError: see `kinds_of`.
+    """
+    return "left" in kinds_of(world)
+
+
 def knows_bodies(world: World) -> bool:
     """Returns whether the world's reader can find the simulator's object of an agent."""
     return hasattr(_reader(world), "body_of")

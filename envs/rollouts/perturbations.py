@@ -1,6 +1,6 @@
 """Random interventions in a recorded episode: at random moments, a random agent brakes, accelerates, … for a while.
 
-They are drawn from a stream of their own, a function of the episode's seed alone (`envs.seeding.perturbation_rng`). One
+They are drawn from a stream of their own, a function of the episode's seed alone (`envs.seeding.episode_rng`). One
 agent at a time is perturbed, among those that forecasters get: others would not be seen reacting.
 """
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.rollouts.interventions import intervene, interventions_of, kinds_of
+from envs.rollouts.interventions import intervene, interventions_of, is_on_roads, kinds_of
 from envs.rollouts.world import World
 from envs.simulators.interventions import Intervention, Kind
+from envs.supervision import EnvironmentFailedError
 from predictor.support.errors import UserError
 
 Range = tuple[float, float]
@@ -41,9 +42,13 @@ SHARES: dict[Kind, float] = {"brake": 0.4, "accelerate": 0.2, "left": 0.1, "righ
 """Probability of each kind; among fewer kinds, in proportion. A kind that an agent does not allow is drawn anew."""
 
 
-def mix_for(kinds: tuple[Kind, ...]) -> PerturbationMix:
-    """Returns the mix of the family that allows these kinds."""
-    return ON_ROADS if "left" in kinds else IN_ARENAS
+def mix_for(world: World) -> PerturbationMix:
+    """Returns the mix of the world's family.
+
+    Raises:
+        UserError: the world cannot be perturbed.
+    """
+    return ON_ROADS if is_on_roads(world) else IN_ARENAS
 
 
 class Perturber:
@@ -63,7 +68,7 @@ class Perturber:
         """Derives how often an intervention begins."""
         allowed = check_kinds(world, kinds)
         self._world, self._rng = world, rng
-        self._mix = mix_for(kinds_of(world))
+        self._mix = mix_for(world)
         self._kinds = allowed
         weights = np.array([SHARES[kind] for kind in allowed])
         self._weights = weights / weights.sum()
@@ -88,6 +93,8 @@ class Perturber:
                     continue
                 try:
                     intervene(self._world, self._draw(int(agent), kind))
+                except EnvironmentFailedError:
+                    raise
                 except UserError:
                     continue  # a landmark, the outermost lane, the ego taken out
                 self._latest = (int(agent), kind)

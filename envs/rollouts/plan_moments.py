@@ -21,7 +21,7 @@ from envs.rollouts.moving import moving_agents
 from envs.rollouts.reactions import STRAIGHT
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import EgoWorld, World
-from envs.seeding import plan_rng
+from envs.seeding import Purpose, episode_rng
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import has_scale
 from predictor.scene import Forecast, Scene, SceneBatch
@@ -79,7 +79,7 @@ def play_plans(task: PlanTask) -> list[PlanMoment]:
         )
         for name, forecaster in found.items()
     }
-    first = int(plan_rng(task.seed).integers(EVERY))
+    first = int(episode_rng(task.seed, Purpose.PLANS).integers(EVERY))
     moments = []
     for step in range(task.max_steps):
         for forecaster in forecasters.values():

@@ -1,6 +1,7 @@
 """Measures what-if forecasts in one environment: errors with and without the ego's plan, and choices between plans."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.interventions import knows_bodies
 from envs.rollouts.plan_moments import EVERY, FIRST_STEP, PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.world import open_world
+from envs.rollouts.world import open_to_look
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.standard_errors import Estimate, estimate, quotient
 from predictor.support.errors import UserError
@@ -94,7 +95,7 @@ class EnvPlans:
         return name_with(self.env_id, self.env_kwargs)
 
 
-def check_has_plans(env_id: str, env_kwargs: str = "", driver: str = "idle") -> None:
+def check_has_plans(env_id: str, driver: str, env_kwargs: str = "") -> None:
     """Checks that the ego of an environment has plans, and that these can be played and judged.
 
     A trained policy (.zip) is not loaded for it: the environment is opened with an idle ego.
@@ -102,8 +103,7 @@ def check_has_plans(env_id: str, env_kwargs: str = "", driver: str = "idle") -> 
     Raises:
         UserError: it has none, the environment cannot be copied or reports no crashes, or it is unknown.
     """
-    world = open_world(env_id, "idle" if driver.endswith(".zip") else driver, env_kwargs=env_kwargs)
-    try:
+    with closing(open_to_look(env_id, driver, env_kwargs)) as world:
         if not world.spec.has_ego:
             raise UserError(f"plans are those of one ego, and {env_id} has several agents; use an env with one ego")
         plan_model_for(world.env)
@@ -122,8 +122,6 @@ def check_has_plans(env_id: str, env_kwargs: str = "", driver: str = "idle") -> 
                 f"plans are played in copies, and copy.deepcopy of {env_id} failed ({type(error).__name__}: {error}); "
                 "make its class copyable (__deepcopy__)"
             ) from error
-    finally:
-        world.close()
 
 
 def measure_plans(run: PlanRun) -> EnvPlans:
@@ -133,12 +131,11 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         UserError: the environment has no plan model, cannot be copied, checkpoints perceive differently, none fits, or
             no episode is long enough.
     """
-    check_has_plans(run.env_id, run.env_kwargs, run.driver)
-    world = run.open()
-    spec = world.spec
-    world.reset(run.seed)
-    names = plan_model_for(world.env).names
-    world.close()
+    check_has_plans(run.env_id, run.driver, run.env_kwargs)
+    with closing(run.open()) as world:
+        spec = world.spec
+        world.reset(run.seed)
+        names = plan_model_for(world.env).names
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
     tasks = [PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon) for i in range(run.episodes)]

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import LEADER, NO_EDGE, SceneLabels
 from envs.rollouts.causal_labels import settings_for
-from envs.rollouts.interventions import body_of, interventions_of, kinds_of
+from envs.rollouts.interventions import body_of, interventions_of, is_on_roads
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.world import EgoWorld, World
 from envs.simulators.highway_interventions import CHANGE_MPS
@@ -122,7 +122,7 @@ def _least_speed(cell: Cell, world: World) -> float:
     """Returns the speed [m/s] below which a sender's braking would be next to nothing."""
     if cell.kind != "brake":
         return 0.0
-    if cell.change_mps is not None or "left" in kinds_of(world):
+    if cell.change_mps is not None or is_on_roads(world):
         return (cell.change_mps or CHANGE_MPS["brake"]) / 2
     return STILL_SHARE * world.spec.feature_scales[world.spec.position_dim]
 

@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint
-from envs.rollouts.causal_labels import ON_ROADS, settings_for
 from envs.rollouts.cause_run import CauseTask
+from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
-from envs.seeding import reaction_rng
+from envs.seeding import Purpose, episode_rng
 from envs.simulators.interventions import Intervention
 from envs.supervision import EnvironmentFailedError
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -86,7 +86,7 @@ def play_reactions(task: ReactionTask) -> list[Perturbation]:
     """Plays one episode and returns its perturbations."""
     world = task.opened()
     forecasters = _forecasters(task, world.spec)
-    rng = reaction_rng(task.seed)
+    rng = episode_rng(task.seed, Purpose.REACTIONS)
     found: list[Perturbation] = []
     for step in range(task.max_steps):
         chosen = rng.random() < SHARE and step >= FIRST_STEP
@@ -146,7 +146,7 @@ class Moment:
             predicted_m = self._predicted(branches.perturbed.perceived[0], receiver)
             if predicted_m is not None:
                 crashed = receiver in branches.plain.crashed | branches.perturbed.crashed
-                swerved = _swerved(branches, receiver) if settings_for(self._world) is ON_ROADS else None
+                swerved = _swerved(branches, receiver) if is_on_roads(self._world) else None
                 return Perturbation(cell.name, 0, 0, sender, receiver, true_m, predicted_m, crashed, swerved)
         return None
 

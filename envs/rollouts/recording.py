@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envs.readers.highway_labels import SceneLabels, with_labels
-from envs.rollouts.branch_recording import BranchRecording, branch_mix_for, record_branches
+from envs.rollouts.branch_recording import BranchRecording, record_branches
 from envs.rollouts.causal_labels import CausalLabels, CausalSettings, causal_labels, with_causal_labels
 from envs.rollouts.interventions import interventions_of
 from envs.rollouts.perturbations import Perturber
 from envs.rollouts.world import World
-from envs.seeding import label_rng, perturbation_rng
+from envs.seeding import Purpose, episode_rng
 from envs.simulators.interventions import Kind
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.scene import Scene
@@ -37,12 +37,8 @@ class Recording:
     """Number of steps from one with causal labels to the next; 0 records none."""
     causal: CausalSettings | None = None
     """How causal labels are measured; needed if they are."""
-    branches: int = 0
-    """Number of branches recorded in place of the episode."""
-    branch_history_steps: int = 10
-    """Largest number of steps before the moment of a branch."""
-    twins: bool = False
-    """Whether each branch is followed by its twin, without the intervention."""
+    branches: BranchRecording | None = None
+    """Branches that are recorded in place of the episode."""
 
 
 def record_all(world: World, seed: int, label: str, settings: Recording) -> list[Episode]:
@@ -57,13 +53,9 @@ def record_all(world: World, seed: int, label: str, settings: Recording) -> list
     Raises:
         UserError: the world cannot be perturbed or copied, where that is asked for.
     """
-    if not settings.branches:
+    if settings.branches is None:
         return [record(world, seed, label, settings)]
-    assert settings.causal is not None
-    branches = BranchRecording(
-        settings.branches, settings.branch_history_steps, branch_mix_for(world), settings.causal, settings.twins
-    )
-    return record_branches(world, seed, label, settings.max_steps, branches)
+    return record_branches(world, seed, label, settings.max_steps, settings.branches)
 
 
 def record(world: World, seed: int, label: str, settings: Recording) -> Episode:
@@ -81,8 +73,9 @@ def record(world: World, seed: int, label: str, settings: Recording) -> Episode:
     world.reset(seed)
     perturber = None
     if settings.perturb:
-        perturber = Perturber(world, settings.perturb, settings.perturb_kinds, perturbation_rng(seed))
-    first_labelled = int(label_rng(seed).integers(settings.causal_every)) if settings.causal_every else 0
+        perturber = Perturber(world, settings.perturb, settings.perturb_kinds, episode_rng(seed, Purpose.PERTURBATIONS))
+    every = settings.causal_every
+    first_labelled = int(episode_rng(seed, Purpose.LABELS).integers(every)) if every else 0
     scenes: list[Scene] = []
     edges: list[SceneLabels] = []
     marks: list[Mapping[int, Kind]] = []
@@ -94,7 +87,7 @@ def record(world: World, seed: int, label: str, settings: Recording) -> Episode:
             edges.append(found)
         if ended or step == settings.max_steps:
             break
-        if settings.causal_every and step % settings.causal_every == first_labelled:
+        if every and step % every == first_labelled:
             assert settings.causal is not None
             causal[step] = causal_labels(world, settings.causal)
         if perturber is not None:
@@ -104,7 +97,7 @@ def record(world: World, seed: int, label: str, settings: Recording) -> Episode:
     episode = Episode.from_scenes(scenes, label=label, seed=seed)
     if perturber is not None:
         episode = _with_marks(episode, marks)
-    if settings.causal_every:
+    if every:
         episode = with_causal_labels(episode, causal)
     return with_labels(episode, scenes, edges) if edges else episode
 

@@ -119,9 +119,12 @@ def fitting_checkpoints(
     return tuple(fitting), misfits
 
 
-@functools.lru_cache(maxsize=4)
-def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...], env_kwargs: str = "") -> World:
-    """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
+def open_for_checkpoints(env_id: str, driver: str, checkpoints: tuple[str, ...], env_kwargs: str = "") -> World:
+    """Makes an environment whose ego perceives what the first learned checkpoint was trained on.
+
+    Raises:
+        UserError: see `envs.rollouts.world.open_world`.
+    """
     first = next((name for name in checkpoints if name != CONSTANT_VELOCITY), None)
     if sees_forecasts(driver):
         return open_world(env_id, driver, first or CONSTANT_VELOCITY, env_kwargs=env_kwargs)

@@ -311,6 +311,15 @@ def open_world(
     return world
 
 
+def open_to_look(env_id: str, driver: str, env_kwargs: str = "") -> World:
+    """Makes an environment that is looked at and not played: in place of a trained policy an idle ego drives.
+
+    Raises:
+        UserError: see `open_world`.
+    """
+    return open_world(env_id, "idle" if driver.endswith(".zip") else driver, env_kwargs=env_kwargs)
+
+
 def _unpadded(scene: Scene) -> Scene:
     """Returns the agents that are there, in arrays of their own."""
     there = scene.valid

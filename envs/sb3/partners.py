@@ -3,40 +3,26 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from envs.sampled_actions import uniform_action
 from predictor.support.errors import UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
 """Driver of the agents that do not learn: the env, their observations, a generator → an action for each of them."""
 
 
-def random_actions(
-    env: ParallelEnv, observations: dict[str, Any], generator: np.random.Generator
-) -> dict[str, NDArray[Any] | int]:
-    """Returns actions drawn uniformly from each agent's Discrete or bounded Box space: the partner "random".
+def random_actions(env: ParallelEnv, observations: dict[str, Any], generator: np.random.Generator) -> dict[str, Any]:
+    """Returns actions drawn uniformly (`envs.sampled_actions`): the partner "random".
 
     Raises:
-        UserError: an agent's action space is another one.
+        UserError: an agent's action space cannot be drawn from.
     """
-    actions: dict[str, NDArray[Any] | int] = {}
-    for agent in observations:
-        space = env.action_space(agent)
-        if isinstance(space, gym.spaces.Discrete):
-            actions[agent] = int(space.start + generator.integers(space.n))
-        elif isinstance(space, gym.spaces.Box) and space.is_bounded():
-            if np.issubdtype(space.dtype, np.integer):
-                actions[agent] = generator.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
-            else:
-                actions[agent] = np.asarray(generator.uniform(space.low, space.high), dtype=space.dtype)
-        else:
-            raise UserError(
-                f"partner 'random' needs Discrete or bounded Box actions, agent '{agent}' has {space}; pass a callable"
-            )
-    return actions
+    return {
+        agent: uniform_action(env.action_space(agent), generator, "random partners", "pass a callable as partner")
+        for agent in observations
+    }
 
 
 PARTNERS: dict[str, Partner] = {"random": random_actions}

@@ -16,7 +16,8 @@ from envs.testing.motion import heading_problems, misfit_problems, motion_proble
 from envs.testing.playing import Episode, Moment, frozen
 from predictor.data import store
 from predictor.scene import SceneSpec
-from predictor.support.errors import short
+from predictor.scene_checks import check_resolution
+from predictor.support.errors import UserError, short
 
 MOST_STATES = 100_000
 """Largest number of agents' states of a recording that is looked at: about a second."""
@@ -74,18 +75,13 @@ def _not_finite(episodes: Sequence[Episode]) -> list[str]:
 
 
 def _rounded(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
-    """Finds positions so far from the origin that 32 bits round them to more than a thousandth of their scale."""
-    axes = spec.position_dim
-    farthest_m = max(
-        (np.abs(m.states[:, :axes]).max() for e in episodes for m in e.moments if len(m.states)), default=0
-    )
-    rounded_m = float(np.spacing(np.float32(farthest_m)))
-    if rounded_m <= 1e-3 * min(spec.feature_scales[:axes]):
-        return []
-    return [
-        f"positions of up to {farthest_m:,.0f} m are recorded in steps of {rounded_m:.2g} m (float32); subtract a "
-        "fixed place of the map in read"
-    ]
+    """Finds positions so far from zero that recordings, which are float32, do not keep them well enough."""
+    states = [moment.states for episode in episodes for moment in episode.moments]
+    try:
+        check_resolution(np.concatenate(states), spec, "recordings of states")
+    except UserError as error:
+        return [str(error)]
+    return []
 
 
 def _unseen(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:

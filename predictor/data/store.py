@@ -33,6 +33,7 @@ from predictor.data.store_files import (
     read_header,
 )
 from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.scene_checks import check_resolution
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
 from predictor.support.files import check_place, new_folder, plain, told_of
@@ -135,8 +136,8 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     """Writes a store; nothing appears under `path` until it is complete.
 
     Raises:
-        UserError: no episodes, arrays that do not fit, non-finite states, `path` exists and `overwrite` is not set, or
-            another process writes it.
+        UserError: no episodes, arrays that do not fit, states that are not finite or too far from zero for float32,
+            `path` exists and `overwrite` is not set, or another process writes it.
     """
     path = Path(path)
     check_new_store(path, overwrite)
@@ -151,6 +152,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
     for episode in episodes:
         check_episode(episode, info.spec, str(path))
         check_finite(episode, str(path))
+        check_resolution(episode.states, info.spec, f"{address(path)}, episode seed {episode.seed}")
         if episode.perturbed is not None and not np.isin(episode.perturbed, range(len(PERTURBATIONS))).all():
             raise UserError(f"{address(path)}: perturbed must lie between 0 and {len(PERTURBATIONS) - 1}")
     marked = [e.perturbed is not None for e in episodes]

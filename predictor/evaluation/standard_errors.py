@@ -92,12 +92,12 @@ def batch_interval(
     Returns:
         Lower and upper limit, or None with fewer than two batches with a count above 0.
     """
-    if np.count_nonzero(counts) < 2:
-        return None
-    totals, numbers = bootstrap_sums(np.stack([sums, counts], axis=1), seed).T
-    ratios = totals[numbers > 0] / numbers[numbers > 0]
-    low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
-    return float(low), float(high)
+
+    def value(totals: Float[np.ndarray, "draws 2"]) -> Float[np.ndarray, " draws"]:
+        ratio = quotient(totals[:, 0], totals[:, 1])
+        return np.sqrt(ratio) if root else ratio
+
+    return bootstrap_interval(np.stack([sums, counts], axis=1), value, seed)
 
 
 def summed(
@@ -193,4 +193,4 @@ def subset_ratios(
     parts = np.array_split(order, max(1, min(num_subsets, len(sums))))
     numerator = np.array([sums[part].sum() for part in parts])
     denominator = np.array([counts[part].sum() for part in parts])
-    return np.where(denominator > 0, numerator / np.where(denominator > 0, denominator, 1.0), np.nan)
+    return quotient(numerator, denominator)

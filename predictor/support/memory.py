@@ -50,19 +50,6 @@ def check_memory(needed_bytes: int, what: str, advice: str, available_bytes: int
         )
 
 
-def check_processes(count: int, name: str) -> None:
-    """Checks that this many worker processes fit into the memory.
-
-    Args:
-        count: number of processes.
-        name: name of the option, for the message.
-
-    Raises:
-        UserError: they do not fit.
-    """
-    check_count(count, name, PROCESS_BYTES)
-
-
 def check_count(count: int, name: str, each_bytes: int = ITEM_BYTES) -> None:
     """Checks that this many things of at least `each_bytes` fit into the memory.
 

@@ -109,10 +109,10 @@ def precision(kind: Precision, device: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def tensor_cores(allowed: bool) -> Iterator[None]:
-    """Lets products of float32 on CUDA round their inputs to TF32 inside the block; else keeps torch's setting."""
+def float32_products(kind: Literal["highest", "high"]) -> Iterator[None]:
+    """Sets torch's precision of products of float32 inside the block; "high" lets CUDA round their inputs to TF32."""
     before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if allowed else before)
+    torch.set_float32_matmul_precision(kind)
     try:
         yield
     finally:

@@ -6,6 +6,7 @@ that was not.
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.noise import NoiseOfRows, TrainingNoise
 from predictor.support.errors import UserError
 from predictor.support.files import new_file
-from predictor.support.runtime import precision, tensor_cores
+from predictor.support.runtime import float32_products, precision
 from predictor.training.batches import Plan, open_batches, plan
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import (
@@ -161,7 +162,7 @@ class Trainer:
     ) -> Mapping[str, Tensor]:
         """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
-        with tensor_cores(kind == "tf32"):
+        with float32_products("high") if kind == "tf32" else nullcontext():
             with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
                 more = {"num_modes": num_modes} if num_modes > 1 else {}
                 output = self.model.window(

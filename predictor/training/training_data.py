@@ -40,7 +40,7 @@ def load_data(config: TrainConfig) -> TrainingData:
 
     Raises:
         UserError: stores differ in features, dt_s or whether there is an ego, have too few episodes, or val_data plays
-            episodes of data.
+            episodes of data or holds scenes of its recordings.
     """
     stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
     if config.causal_edges:
@@ -62,10 +62,10 @@ def load_data(config: TrainConfig) -> TrainingData:
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:
         cut = len(config.data)
-        _check_held_out(paths, stores, cut)
         training, held_back = ({content_id(path) for path in part} for part in (config.data, config.val_data))
         if training & held_back:
             raise UserError("val_data holds a store of data, so that nothing would be held out; leave val_data out")
+        _check_held_out(paths, stores, cut)
         chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
         train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
         val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
@@ -131,14 +131,14 @@ def _differences(paths: Sequence[str], stores: Sequence[EpisodeStore]) -> tuple[
     return tuple(
         f"{name} is {getattr(first, name)} in {paths[0]} and {getattr(store.info.spec, name)} in {path}; the "
         "checkpoint keeps that of the first"
-        for name in ("frame", "perception_m")
+        for name in ("frame", "perception_m", "feature_scales")
         for path, store in zip(paths, stores, strict=False)
         if getattr(store.info.spec, name) != getattr(first, name)
     )
 
 
 def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: int) -> None:
-    """Checks that no store from `cut` on plays a seed of those before."""
+    """Checks that no store from `cut` on plays a seed of those before, or has a scene of their recordings."""
     played = [{p for i in range(len(store.episodes)) if (p := _played(store, i)) is not None} for store in stores]
     for path, theirs in zip(paths[cut:], played[cut:], strict=True):
         for trained, ours in zip(paths[:cut], played[:cut], strict=True):
@@ -148,6 +148,24 @@ def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: i
                     f"seeds, such as {min(seed for _, seed in both)}; collect it with another --seed, or leave "
                     "val_data out"
                 )
+    recorded = [set() if "seed" in store.info.provenance else _scenes(store) for store in stores]
+    for path, held_out in zip(paths[cut:], recorded[cut:], strict=True):
+        for trained, scenes in zip(paths[:cut], recorded[:cut], strict=True):
+            if common := held_out & scenes:
+                raise UserError(
+                    f"{path} (val_data) has {len(common)} of its {len(held_out)} scenes in common with {trained}: the "
+                    "same recording; make it from other files, or leave val_data out"
+                )
+
+
+def _scenes(store: EpisodeStore) -> set[int]:
+    """Returns a hash of each scene with two agents or more, by which a recording is known again."""
+    return {
+        hash(states[there].tobytes())
+        for episode in store.episodes
+        for states, there in zip(episode.states, episode.valid, strict=True)
+        if there.sum() > 1
+    }
 
 
 def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:

@@ -14,7 +14,7 @@ COMMANDS = sorted(name for name, text in MODULES.items() if "run_entry_point(mai
 
 
 def test_there_are_commands():
-    assert {"wrapper_overhead", "envpool_training", "gpu_springs", "churn"} <= set(COMMANDS)
+    assert {"wrapper_overhead", "envpool_training", "gpu_springs"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))

@@ -12,7 +12,8 @@ from envs.readers import multiagent_reader_for
 from envs.registry import make_multiagent_env
 from envs.rollouts import episode as live
 from envs.rollouts import reactions
-from envs.rollouts.side_forecasts import kept_forecaster, kept_world
+from envs.rollouts.kept_world import close_kept_world
+from envs.rollouts.side_forecasts import kept_forecaster
 from envs.rollouts.workers import EpisodePool
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -45,14 +46,13 @@ def save_tag(path: Path, has_ego: bool = False, **changes: Any) -> str:
 def forget() -> None:
     """Drop what `envs.rollouts` keeps from episode to episode: nothing of one test may serve in another."""
     for kept in (
-        live._kept_world,
         live._kept_controls,
         live._kept_ablations,
-        kept_world,
         reactions._kept_neighbours,
         kept_forecaster,
     ):
         kept.cache_clear()
+    close_kept_world()
 
 
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:

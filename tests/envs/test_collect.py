@@ -280,7 +280,8 @@ def test_options_reach_the_recording_and_its_processes(tmp_path: Path, monkeypat
         causal_threshold_m=0.2, causal_horizon_s=0.7,
     )  # fmt: skip
     made = collect.recording_of(settings)
-    assert made.causal is not None and (made.branches, made.branch_history_steps) == (2, 4)
+    assert made.branches is not None and made.causal is made.branches.causal
+    assert (made.branches.branches, made.branches.history_steps) == (2, 4)
     assert (made.causal.senders, made.causal.threshold_m, made.causal.horizon_s) == (3, 0.2, 0.7)
     asked: list[tuple[Any, ...]] = []
     monkeypatch.setattr(collect, "episode_pool", lambda *given: asked.append(given) or nullcontext())

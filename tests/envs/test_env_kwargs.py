@@ -9,6 +9,7 @@ from envs import collect, evaluate
 from envs.collect import CollectConfig
 from envs.registry import make_env
 from envs.rollouts import side_forecasts
+from envs.rollouts.kept_world import close_kept_world
 from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import World, open_world
 from predictor.data.store import read_store
@@ -110,11 +111,15 @@ def test_an_evaluation_says_so(measured: dict[str, Any]):
 def test_data_of_another_environment_is_no_data_of_this_one(measured: dict[str, Any]):
     few, many = (measured["folder"] / name for name in ("few", "many"))
     same = json.dumps(json.loads(FEW), indent=1)
-    assert evaluate._stores_of([few], ROAD, same) == (str(few),)
-    assert evaluate._stores_of([many], ROAD) == (str(many),)
+
+    def asked(store: Path, kwargs: str = "") -> evaluate.EvaluateConfig:
+        return evaluate.EvaluateConfig((ROAD,), kwargs, data=(store,))
+
+    assert evaluate._stores_of(asked(few, same), ROAD) == (str(few),)
+    assert evaluate._stores_of(asked(many), ROAD) == (str(many),)
     for store, kwargs in ((few, ""), (many, FEW)):
         with pytest.raises(UserError, match=f"data: no store of {ROAD}"):
-            evaluate._stores_of([store], ROAD, kwargs)
+            evaluate._stores_of(asked(store, kwargs), ROAD)
     assert np.isfinite(measured["results"][0]["reduction"])
 
 
@@ -137,7 +142,7 @@ def test_causes_are_measured_in_the_changed_environment(
         crowds.append(made.env.unwrapped.config["vehicles_count"])  # type: ignore[attr-defined]
         return made
 
-    side_forecasts.kept_world.cache_clear()
+    close_kept_world()
     monkeypatch.setattr(EpisodePool, "results", lambda self, tasks: map(self._play, tasks))
     monkeypatch.setattr(side_forecasts, "open_world", opened)
     base = ["--env-ids", ROAD, "--checkpoint", "constant-velocity", "--workers", "1"]
@@ -153,11 +158,9 @@ def test_causes_are_measured_in_the_changed_environment(
 
 
 def test_a_driver_that_sees_forecasts_drives_in_the_changed_environment(monkeypatch: pytest.MonkeyPatch):
-    side_forecasts.kept_world.cache_clear()
     monkeypatch.setattr(side_forecasts, "sees_forecasts", lambda driver: True)
-    world = side_forecasts.kept_world(ROAD, "idle", ("constant-velocity",), FEW)
+    world = side_forecasts.open_for_checkpoints(ROAD, "idle", ("constant-velocity",), FEW)
     assert world.env.unwrapped.config["vehicles_count"] == 2  # type: ignore[attr-defined]
-    side_forecasts.kept_world.cache_clear()
 
 
 def test_plans_that_the_changed_environment_lacks_are_missed_before_hours_of_work(

@@ -120,10 +120,10 @@ def test_a_checkpoint_that_does_not_fit_is_refused_before_anything_is_measured(
 def test_as_many_processes_are_checked_as_may_start(
     options: dict[str, Any], processes: int, monkeypatch: pytest.MonkeyPatch
 ):
-    asked: list[int] = []
-    monkeypatch.setattr(evaluate, "check_processes", lambda count, name: asked.append(count))
+    asked: dict[str, int] = {}
+    monkeypatch.setattr(evaluate, "check_count", lambda count, name, each_bytes=0: asked.update({name: count}))
     evaluate.EvaluateConfig(("highway-fast-v0",), episodes=50, workers=300, **options)
-    assert asked == [processes]
+    assert asked["workers"] == processes
 
 
 ERRORS = {

@@ -6,6 +6,7 @@ import pytest
 
 import train_policy
 from envs import collect, evaluate
+from envs.rollouts.kept_world import close_kept_world
 from predictor.data.store import read_store
 from predictor.support.reading import read_json
 from tests.envs.helpers import run_command
@@ -15,10 +16,10 @@ from tests.envs.own_code import ONE_ONLY, OneOnly
 @pytest.fixture(autouse=True)
 def free(monkeypatch: pytest.MonkeyPatch):
     """No simulator runs in this process, before and after."""
-    collect.close_world()
+    close_kept_world()
     monkeypatch.setattr(OneOnly, "running", None)
     yield
-    collect.close_world()
+    close_kept_world()
 
 
 def test_a_second_one_is_refused():

@@ -60,7 +60,8 @@ def test_entries_are_bounded_masked_and_sorted():
     assert env.plan_model.names == ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
     assert env.what_if.num_plans == 5
     scenes = SceneBatch.stack([env.scene])
-    found, order = contacts(env.what_if, scenes), others_by_distance(scenes)[0]
+    dt_s, order = env.get_wrapper_attr("scene_spec").dt_s, others_by_distance(scenes)[0]
+    found = contacts(env.what_if, scenes, env.plans.size_m, dt_s)
     there = obs["valid"] == 1
     np.testing.assert_allclose(obs["what_if_gap"][there], found.gap_m[0, :, 0].T[order][there], rtol=1e-5)
     np.testing.assert_allclose(obs["what_if_risk"][there], found.risk()[0].T[order][there], rtol=1e-5)
@@ -78,8 +79,10 @@ def test_a_turned_scene_has_the_same_entries():
     states[..., :2], states[..., 2:4] = states[..., :2] @ turn.T, states[..., 2:4] @ turn.T
     turned = SceneBatch(states, scenes.ids, scenes.valid, scenes.heading_rad + np.pi / 2)
     xy = forecast.xy @ forecast.xy.new_tensor(turn).T
-    other = what_if_entries(turned, type(forecast)(xy, forecast.edge_probs, forecast.edge_features, forecast.valid))
-    for key, value in what_if_entries(scenes, forecast).items():
+    other = what_if_entries(
+        turned, type(forecast)(xy, forecast.edge_probs, forecast.edge_features, forecast.valid), (5.0, 2.0), 1.0
+    )
+    for key, value in what_if_entries(scenes, forecast, (5.0, 2.0), 1.0).items():
         np.testing.assert_allclose(other[key], value, atol=1e-3, err_msg=key)
 
 

@@ -553,6 +553,14 @@ def test_ten_kilometres_down_the_road_nothing_changes(forecaster: DGVAE):
     assert_same(there, here, tolerance=1e-6)
 
 
+def test_positions_that_single_precision_cannot_tell_apart_are_refused(forecaster: DGVAE):
+    """On a map whose origin is thousands of kilometres away; along the road the ego's position is subtracted before."""
+    after(forecaster, *(shifted(s, x_m=5_400_000.0) for s in drive()))
+    far = batch(shifted(drive()[0], y_m=-5_400_000.0))
+    with pytest.raises(UserError, match=r"states of scenes: y_m lies up to 54000[.\d]* .* steps of 0.5; subtract"):
+        online(forecaster).observe(far)
+
+
 def test_across_the_road_it_matters(forecaster: DGVAE):
     here, aside = after(forecaster, *drive()), after(forecaster, *(shifted(s, y_m=10.0) for s in drive()))
     assert differ(here, aside) > 1e-2

@@ -8,7 +8,6 @@ import numpy as np
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from benchmarks.churn import Churning, read
 from envs.parallel import ForecastParallelEnv
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.function import FunctionReader
@@ -84,6 +83,47 @@ class Field(ParallelEnv):
 
     def _observed(self, names: list[str]) -> dict[str, Any]:
         return {agent: np.zeros(1, np.float32) for agent in names}
+
+
+class Churning(gym.Env):
+    """Road on which some agents vanish at each step and others appear, with ids never used before."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, agents: int, replaced: float) -> None:
+        """Sets the mean number of agents around the ego and the share that is replaced at each step."""
+        self._mean, self._replaced = agents, replaced
+        self._next = 1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode with new agents."""
+        super().reset(seed=seed)
+        self.states, self.ids = np.array([[0.0, 4.0, 25.0, 0.0]]), np.array([0])
+        self._enter(self._mean)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Moves all agents, replaces some, and ends the episode with probability 0.03."""
+        self.states[:, :2] += self.states[:, 2:]
+        stays = self.np_random.random(len(self.ids)) > self._replaced
+        stays[0] = True
+        self.states, self.ids = self.states[stays], self.ids[stays]
+        self._enter(int(self.np_random.poisson(max(0.0, self._mean + 1 - len(self.ids)))))
+        ended = bool(self.np_random.random() < 0.03)
+        return np.zeros(1, np.float32), 0.0, ended, False, {}
+
+    def _enter(self, count: int) -> None:
+        near = self.np_random.normal(size=(count, 4)) * (30, 4, 3, 0.1) + self.states[0] * (1, 0, 1, 0)
+        self.states = np.concatenate([self.states, near])
+        self.ids = np.concatenate([self.ids, self._next + np.arange(count)])
+        self._next += count
+
+
+def read(env: gym.Env) -> Scene:
+    """Returns the scene of all agents on the road."""
+    inner: Any = env.unwrapped
+    return Scene(inner.states.copy(), inner.ids.astype(np.int64), np.ones(len(inner.ids), dtype=np.bool_))
 
 
 class FieldReader:

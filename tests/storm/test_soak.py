@@ -12,14 +12,13 @@ from typing import Any
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from benchmarks.churn import Churning, read
 from envs.readers.function import FunctionReader
 from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.storm import soak as module
 from tests.storm.soak import LIMITS, NAMES, Limit, Sample, SoakConfig, count_entries, judge, soak, take_sample
-from tests.storm.soak_subjects import SUBJECTS
+from tests.storm.soak_subjects import SUBJECTS, Churning, read
 
 ROWS, STEPS, SAMPLES = 12, 1200, 8
 SHORT = LIMITS | {"memory_mb": Limit(12.0, 0.0), "entries": Limit(400.0, 0.0)}

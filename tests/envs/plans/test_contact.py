@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ def meet(
     return forecast, SceneBatch(states, np.array([[0, 1]]), np.ones((1, 2), dtype=np.bool_), np.zeros(1))
 
 
+SIZE_M = (5.0, 2.0)
+found_contacts = partial(contacts, size_m=SIZE_M, dt_s=1.0)
 STRAIGHT = [(10.0, 0.0), (20.0, 0.0)]
 
 
@@ -48,7 +51,7 @@ STRAIGHT = [(10.0, 0.0), (20.0, 0.0)]
 def test_gap_and_first_contact_in_closed_form(
     other: list[tuple[float, float]], now: tuple[float, float, float, float], gap_m: float, share: float
 ):
-    found = contacts(*meet(STRAIGHT, other, now))
+    found = found_contacts(*meet(STRAIGHT, other, now))
     assert found.gap_m.shape == (1, 1, 1, 1)
     assert found.gap_m[0, 0, 0, 0] == pytest.approx(gap_m, abs=1e-4)
     assert found.share[0, 0, 0, 0] == pytest.approx(share)
@@ -57,21 +60,21 @@ def test_gap_and_first_contact_in_closed_form(
 
 def test_a_fast_crossing_between_two_steps_is_seen():
     """At the steps themselves both are far apart."""
-    found = contacts(*meet([(10.0, 0.0), (20.0, 0.0)], [(6.0, -20.0), (6.0, -70.0)], (6.0, 30.0, 0.0, -50.0)))
+    found = found_contacts(*meet([(10.0, 0.0), (20.0, 0.0)], [(6.0, -20.0), (6.0, -70.0)], (6.0, 30.0, 0.0, -50.0)))
     assert found.by_step.any()
     apart = np.hypot(6.0 - np.array([10.0, 20.0]), [-20.0, -70.0])
     assert apart.min() > 15
 
 
 def test_a_contact_stays_one_for_later_steps():
-    found = contacts(*meet(STRAIGHT, [(10.0, 0.0), (40.0, 0.0)], (12.0, 0.0, 0.0, 0.0)))
+    found = found_contacts(*meet(STRAIGHT, [(10.0, 0.0), (40.0, 0.0)], (12.0, 0.0, 0.0, 0.0)))
     assert found.by_step[0, 0, 0, 0].tolist() == [True, True]
 
 
 def test_risk_weighs_modes_by_their_probability():
     away, ahead = [(40.0, 0.0), (50.0, 0.0)], [(20.0, 0.0), (20.0, 0.0)]
     forecast, scene = meet(STRAIGHT, away, (20.0, 0.0, 0.0, 0.0), [0.7, 0.3], [away, ahead])
-    found = contacts(forecast, scene)
+    found = found_contacts(forecast, scene)
     np.testing.assert_allclose(found.risk(), [[[0.3]]], atol=1e-6)
     np.testing.assert_allclose(found.survival()[0, 0, -1], 0.7, atol=1e-6)
 
@@ -89,9 +92,9 @@ def three(probs: torch.Tensor | None) -> tuple[Forecast, SceneBatch]:
 
 
 def test_modes_of_agents_are_independent_and_draws_are_scenes():
-    modes = contacts(*three(torch.full((1, 1, 2, 3), 0.5)))
+    modes = found_contacts(*three(torch.full((1, 1, 2, 3), 0.5)))
     assert modes.survival()[0, 0, -1] == pytest.approx(0.25)
-    draws = contacts(*three(None))
+    draws = found_contacts(*three(None))
     assert draws.survival()[0, 0, -1] == 0.0  # one of them is in the way in every draw
     np.testing.assert_allclose(draws.risk(), [[[0.5, 0.5]]])
 
@@ -99,19 +102,20 @@ def test_modes_of_agents_are_independent_and_draws_are_scenes():
 def test_absent_agents_are_far_away():
     forecast, scene = meet(STRAIGHT, STRAIGHT, (0.0, 0.0, 10.0, 0.0))
     scene.valid[0, 1] = False
-    found = contacts(forecast, scene)
+    found = found_contacts(forecast, scene)
     assert found.gap_m.item() == FAR_M and found.share.item() == 1.0 and not found.by_step.any()
 
 
 def test_a_forecast_that_is_no_number_is_no_free_way():
-    found = contacts(*meet(STRAIGHT, [(np.nan, np.nan), (np.nan, np.nan)], (30.0, 0.0, 10.0, 0.0)))
+    found = found_contacts(*meet(STRAIGHT, [(np.nan, np.nan), (np.nan, np.nan)], (30.0, 0.0, 10.0, 0.0)))
     assert found.by_step.all() and found.share[0, 0, 0, 0] < 1
 
 
 def test_an_ego_alone_meets_nobody():
     forecast, scene = meet(STRAIGHT, STRAIGHT, (30.0, 0.0, 10.0, 0.0))
     alone = Forecast(forecast.xy[:, :, :, :1], *(torch.zeros(1, 1, 1, 2),) * 2, torch.ones(1, 1).bool())
-    found = contacts(alone, SceneBatch(scene.states[:, :1], scene.ids[:, :1], scene.valid[:, :1], scene.heading_rad))
+    of_ego = SceneBatch(scene.states[:, :1], scene.ids[:, :1], scene.valid[:, :1], scene.heading_rad)
+    found = found_contacts(alone, of_ego)
     assert found.share.shape == (1, 1, 1, 0)
     np.testing.assert_array_equal(found.survival(), 1.0)
 
@@ -120,7 +124,7 @@ def test_an_ego_alone_meets_nobody():
 def test_no_head_on_crash_is_jumped_over(ahead_m: float):
     """33 m/s against 33 m/s: 13 m from one instant to the next, of 10 m in which they touch."""
     ego, other = [(33.0, 0.0), (66.0, 0.0)], [(ahead_m - 33.0, 0.0), (ahead_m - 66.0, 0.0)]
-    found = contacts(*meet(ego, other, (ahead_m, 0.0, -33.0, 0.0)))
+    found = found_contacts(*meet(ego, other, (ahead_m, 0.0, -33.0, 0.0)))
     assert found.risk()[0, 0, 0] == 1 and found.gap_m[0, 0, 0, 0] == pytest.approx(-2.0, abs=1e-4)
     assert found.share[0, 0, 0, 0] == pytest.approx((ahead_m - 5) / 132, abs=0.11), "at the nearest instant"
 
@@ -136,7 +140,7 @@ def test_the_least_gap_of_fast_agents_is_that_of_many_instants():
         along, across = 2.5 + 2.5 * abs(cos) + abs(sin), 1 + 2.5 * abs(sin) + abs(cos)
         own = np.maximum(abs(x) - along, abs(y) - across)
         turned = np.maximum(abs(x * cos + y * sin) - along, abs(y * cos - x * sin) - across)
-        least, found = np.maximum(own, turned)[1:].min(), contacts(forecast, scenes).gap_m[0, 0, 0, 0]
+        least, found = np.maximum(own, turned)[1:].min(), found_contacts(forecast, scenes).gap_m[0, 0, 0, 0]
         if np.hypot(*(end - start)) > 20:
             searched += 1
             assert found == pytest.approx(least, abs=4e-3)
@@ -155,7 +159,7 @@ def test_a_slow_agent_turns_whatever_the_length_of_a_step(dt_s: float):
     forecast = Forecast(xy, torch.zeros(1, 2, 2, 2), torch.zeros(1, 2, 2, 1), torch.ones(1, 2).bool())
     states = np.array([[(0.0, 0.0, 1.5, 0.0), (7.6, 7.0, 0.0, 0.0)]])
     scenes = SceneBatch(states, np.array([[0, 1]]), np.ones((1, 2), dtype=np.bool_), np.zeros(1))
-    found = contacts(forecast, scenes, dt_s=dt_s)
+    found = contacts(forecast, scenes, SIZE_M, dt_s)
     assert found.gap_m[0, 0, 0, 0] == pytest.approx(0.9, abs=0.05) and found.risk()[0, 0, 0] == 0
 
 
@@ -163,5 +167,5 @@ def test_an_ego_at_rest_faces_as_the_scene_says():
     """Along y it reaches 2.5 m to the side, along x 1 m; the other's half width is 1 m."""
     forecast, batch = meet([(0.0, 0.0), (0.0, 0.0)], [(10.0, 3.0), (20.0, 3.0)], (0.0, 3.0, 10.0, 0.0))
     batch.states[0, 0, 2:] = 0.0
-    assert not contacts(forecast, batch).by_step.any()
-    assert contacts(forecast, replace(batch, heading_rad=np.full(1, np.pi / 2))).by_step.any()
+    assert not found_contacts(forecast, batch).by_step.any()
+    assert found_contacts(forecast, replace(batch, heading_rad=np.full(1, np.pi / 2))).by_step.any()

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from envs.rollouts import causal_labels as causal_module
 from envs.rollouts.branches import Branch, Branches, BranchPoint, copied
 from envs.rollouts.causal_labels import (
     IN_ARENAS,
@@ -15,10 +16,12 @@ from envs.rollouts.causal_labels import (
     with_causal_labels,
 )
 from envs.rollouts.interventions import intervene
-from envs.rollouts.world import open_world
+from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
+from envs.supervision import EnvironmentFailedError
 from predictor.data.causal_edges import causal_types
 from predictor.data.store import Episode
+from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played, road_world
 
 SETTINGS = replace(ON_ROADS, horizon_s=5.0, threshold_m=0.5)
@@ -42,6 +45,29 @@ def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
     ]
     assert labels.shift_m[1, 2] > 2.0
     assert labels.shift_m.dtype == np.float32
+
+
+def test_a_world_that_cannot_be_copied_has_no_labels_rather_than_unknown_ones(monkeypatch: pytest.MonkeyPatch):
+    world = road_world((0.0, 4.0), (25.0, 4.0), ego_m=(25.0, 12.0))
+    assert senders_of(world, SETTINGS)
+
+    def refused(world: World) -> World:
+        raise UserError("cannot be copied")
+
+    monkeypatch.setattr(causal_module, "copied", refused)
+    with pytest.raises(UserError, match="cannot be copied"):
+        causal_labels(world, SETTINGS)
+
+
+def test_an_environment_that_fails_while_it_is_perturbed_is_not_passed_over(monkeypatch: pytest.MonkeyPatch):
+    world = road_world((0.0, 4.0), (25.0, 4.0), ego_m=(25.0, 12.0))
+
+    def fails(*_: object) -> None:
+        raise EnvironmentFailedError("it raised")
+
+    monkeypatch.setattr(causal_module, "intervene", fails)
+    with pytest.raises(EnvironmentFailedError, match="it raised"):
+        senders_of(world, SETTINGS)
 
 
 @pytest.mark.slow

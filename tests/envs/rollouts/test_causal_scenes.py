@@ -11,7 +11,7 @@ from envs.rollouts import causal_scenes, side_forecasts
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, causal_labels
 from envs.rollouts.causal_scenes import EVERY, FIRST_STEP, GraphTask, labelled_scene, play_graph
 from envs.rollouts.side_forecasts import SideForecaster
-from envs.seeding import label_rng
+from envs.seeding import Purpose, episode_rng
 from predictor.scene import Forecast, Scene
 from tests.envs.evaluation import TAG, forget, save_tag
 from tests.envs.interventions import assert_same_scenes, played, road_world
@@ -112,7 +112,7 @@ def test_an_episode_has_labels_at_every_fifth_step(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(causal_scenes, "labelled_scene", note)
     quick = replace(IN_ARENAS, horizon_s=0.3, senders=2)
     found = play_graph(task(save_tag(tmp_path / "tag"), settings=quick))
-    first = int(label_rng(900_000).integers(EVERY))
+    first = int(episode_rng(900_000, Purpose.LABELS).integers(EVERY))
     expected = [step for step in range(first, 12, EVERY) if step >= FIRST_STEP]
     assert steps == expected and len(found) == len(expected) > 0
     for scene in found:
@@ -149,5 +149,5 @@ def test_a_policy_that_sees_forecasts_perceives_what_the_first_learned_checkpoin
     monkeypatch.setattr(side_forecasts, "sees_forecasts", lambda driver: True)
     monkeypatch.setattr(side_forecasts, "open_world", lambda env_id, driver, seen, **_: opened.append(seen))
     for checkpoints in (("constant-velocity", "mine"), ("mine", "yours"), ("constant-velocity",)):
-        side_forecasts.kept_world.__wrapped__("highway-fast-v0", "policy.zip", checkpoints)
+        side_forecasts.open_for_checkpoints("highway-fast-v0", "policy.zip", checkpoints)
     assert opened == ["mine", "mine", "constant-velocity"]

@@ -3,11 +3,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from envs.rollouts import perturbations
 from envs.rollouts.interventions import interventions_of
 from envs.rollouts.perturbations import ON_ROADS, SHARES, Perturber, check_kinds
 from envs.rollouts.world import open_world
-from envs.seeding import branch_rng, driver_rng, label_rng, perturbation_rng, plan_rng, reaction_rng
+from envs.seeding import Purpose, driver_rng, episode_rng
 from envs.simulators.intervention import Intervention
+from envs.supervision import EnvironmentFailedError
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played
 
@@ -18,7 +20,7 @@ def test_a_share_of_the_steps_is_perturbed_and_every_kind_comes():
     busy, kinds = [], Counter[str]()
     for seed in range(20):
         world.reset(seed)
-        perturber = Perturber(world, 0.5, (), perturbation_rng(seed))
+        perturber = Perturber(world, 0.5, (), episode_rng(seed, Purpose.PERTURBATIONS))
         for _ in range(25):
             perturber()
             now = interventions_of(world)
@@ -33,7 +35,7 @@ def test_a_share_of_the_steps_is_perturbed_and_every_kind_comes():
 def test_always_and_only_one_kind():
     world = open_world("highway-fast-v0", "idle")
     world.reset(0)
-    perturber = Perturber(world, 1.0, ("brake",), perturbation_rng(0))
+    perturber = Perturber(world, 1.0, ("brake",), episode_rng(0, Purpose.PERTURBATIONS))
     for _ in range(4):
         perturber()
         (one,) = interventions_of(world).values()
@@ -49,7 +51,7 @@ def test_none_repeats_what_has_just_ended():
     world, begun = open_world("simple_push_v3", "idle"), 0
     for seed in range(6):
         world.reset(seed)
-        perturber = Perturber(world, 1.0, (), perturbation_rng(seed))
+        perturber = Perturber(world, 1.0, (), episode_rng(seed, Purpose.PERTURBATIONS))
         before = None
         for _ in range(40):
             perturber()
@@ -67,7 +69,7 @@ def test_interventions_follow_from_the_seed_alone():
     for _ in range(2):
         world = open_world("simple_tag_v3", "heuristic")
         world.reset(3)
-        perturber = Perturber(world, 0.7, (), perturbation_rng(3))
+        perturber = Perturber(world, 0.7, (), episode_rng(3, Purpose.PERTURBATIONS))
         scenes = []
         for _ in range(10):
             perturber()
@@ -77,10 +79,29 @@ def test_interventions_follow_from_the_seed_alone():
 
 
 def test_streams_are_independent():
-    draws = [rng.random(4).tolist() for rng in (perturbation_rng(5), label_rng(5), driver_rng(5), driver_rng(5, 1))]
-    draws += [rng.random(4).tolist() for rng in (branch_rng(5), reaction_rng(5), plan_rng(5), np.random.default_rng(5))]
-    assert len({tuple(draw) for draw in draws}) == 8
-    assert perturbation_rng(5).random() == draws[0][0] != perturbation_rng(6).random()
+    streams = [episode_rng(5, purpose) for purpose in Purpose]
+    streams += [driver_rng(5), driver_rng(5, 1), np.random.default_rng(5)]
+    assert len({tuple(rng.random(4).tolist()) for rng in streams}) == 8
+    first = [episode_rng(seed, Purpose.PERTURBATIONS).random() for seed in (5, 5, 6)]
+    assert first[0] == first[1] != first[2]
+
+
+@pytest.mark.parametrize("error", [EnvironmentFailedError("it raised"), UserError("a landmark")])
+def test_an_environment_that_fails_is_no_agent_that_cannot_be_perturbed(
+    error: UserError, monkeypatch: pytest.MonkeyPatch
+):
+    world = open_world("simple_tag_v3", "idle")
+    world.reset(0)
+
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(perturbations, "intervene", fails)
+    perturber = Perturber(world, 1.0, (), episode_rng(0, Purpose.PERTURBATIONS))
+    if not isinstance(error, EnvironmentFailedError):
+        return perturber()
+    with pytest.raises(EnvironmentFailedError, match="it raised"):
+        perturber()
 
 
 def test_kinds_that_are_not_possible_are_named():
@@ -95,7 +116,7 @@ def test_kinds_come_in_their_shares(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("envs.rollouts.perturbations.intervene", lambda world, one: begun.append(one))
     world = open_world("highway-fast-v0", "idle")
     world.reset(0)
-    perturber = Perturber(world, 1.0, (), perturbation_rng(0))
+    perturber = Perturber(world, 1.0, (), episode_rng(0, Purpose.PERTURBATIONS))
     for _ in range(1000):  # nothing acts, so that each call begins one
         perturber()
     counts = Counter(one.kind for one in begun)

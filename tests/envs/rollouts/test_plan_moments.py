@@ -12,7 +12,7 @@ from envs.rollouts.branches import BranchPoint
 from envs.rollouts.plan_moments import EVERY, FIRST_STEP, STRAIGHT, PlanTask, moment, play_plans
 from envs.rollouts.side_forecasts import SideForecaster
 from envs.rollouts.world import EgoWorld, open_world
-from envs.seeding import plan_rng
+from envs.seeding import Purpose, episode_rng
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget
@@ -149,7 +149,7 @@ def plan_task(env_id: str, driver: str, seed: int, max_steps: int, horizon_steps
 def test_moments_come_at_every_fifth_step_from_a_random_one_on():
     task = plan_task("highway-fast-v0", "idle", 7, 16, 2)
     moments = play_plans(task)
-    first = int(plan_rng(7).integers(EVERY))
+    first = int(episode_rng(7, Purpose.PLANS).integers(EVERY))
     assert moments and all(m.step % EVERY == first and m.step >= FIRST_STEP and m.seed == 7 for m in moments)
     again = play_plans(task)
     for one, other in zip(moments, again, strict=True):

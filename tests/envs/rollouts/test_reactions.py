@@ -13,7 +13,7 @@ from envs.rollouts import reactions
 from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
-from envs.rollouts.side_forecasts import SideForecaster, kept_world
+from envs.rollouts.side_forecasts import SideForecaster, open_for_checkpoints
 from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
 from envs.supervision import EnvironmentFailedError
@@ -365,10 +365,10 @@ def test_neighbours_forecast_where_there_is_data(tmp_path: Path, monkeypatch: py
 
 
 def test_an_ego_perceives_what_its_checkpoint_was_trained_on(highway_checkpoint: str):
-    world = kept_world("two-way-v0", "idle", (highway_checkpoint,))
+    world = open_for_checkpoints("two-way-v0", "idle", (highway_checkpoint,))
     spec = world.spec
     assert (spec.perception_m, spec.max_agents) == (HIGHWAY_SPEC.perception_m, HIGHWAY_SPEC.max_agents)
-    plain = kept_world("two-way-v0", "idle", ("constant-velocity",))
+    plain = open_for_checkpoints("two-way-v0", "idle", ("constant-velocity",))
     assert plain.spec.max_agents != HIGHWAY_SPEC.max_agents
-    own = kept_world("two-way-v0", "idle", ("constant-velocity", f"own:{__name__}:Shortsighted"))
+    own = open_for_checkpoints("two-way-v0", "idle", ("constant-velocity", f"own:{__name__}:Shortsighted"))
     assert (own.spec.perception_m, own.spec.max_agents) == (30.0, 3)

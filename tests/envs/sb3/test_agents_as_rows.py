@@ -594,14 +594,16 @@ def test_random_actions_may_have_no_axes():
 
 
 def test_random_actions_cover_each_agents_own_space():
-    own = {"a": THREE, "b": BOX3, "c": spaces.MultiBinary(2)}
+    own = {"a": THREE, "b": BOX3, "c": spaces.MultiBinary(2), "d": spaces.Box(-np.inf, np.inf, (1,))}
     env = with_spaces(dict.fromkeys(own, BOX2), own)()
     generator = np.random.default_rng(0)
-    drawn = [random_actions(env, {"a": 0, "b": 0}, generator) for _ in range(100)]
+    drawn = [random_actions(env, {"a": 0, "b": 0, "c": 0}, generator) for _ in range(100)]
     assert {actions["a"] for actions in drawn} == {-1, 0, 1}
-    assert all(BOX3.contains(actions["b"]) for actions in drawn)
-    with pytest.raises(UserError, match="bounded Box actions, agent 'c'"):
-        random_actions(env, {"c": 0}, generator)
+    assert all(own[name].contains(actions[name]) for actions in drawn for name in ("b", "c"))
+    with pytest.raises(
+        UserError, match="random partners need a Discrete.*bounded Box action space.*pass a callable as"
+    ):
+        random_actions(env, {"d": 0}, generator)
 
 
 def test_a_partner_without_an_action_for_an_agent_is_named():

@@ -12,12 +12,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.drivers.sampled_actions import uniform_action
 from envs.own_observation import own_spaces
 from envs.readers.base import Reader
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
+from envs.sampled_actions import uniform_action
 from envs.testing import check_reader, examine_reader, reader_problems
 from envs.testing.ego import extreme_actions
 from predictor.scene import Scene, SceneSpec
@@ -516,9 +516,8 @@ def test_an_ego_that_sees_nobody_is_told():
 def test_positions_that_a_recording_would_round_are_told():
     far = with_states(lambda states: states + np.array([500_000.0, 5_400_000.0, 0.0, 0.0]))
     (line,) = reader_problems(Crowd(), far, episodes=2, max_steps=5)
-    assert (
-        line.startswith("positions of up to 5,400,0") and "in steps of 0.5 m (float32); subtract a fixed place" in line
-    )
+    assert line.startswith("recordings of states: y_m lies up to 54000")
+    assert line.endswith("float32 has steps of 0.5; subtract one fixed point of the map from all positions")
 
 
 @pytest.mark.parametrize("numbers", [{"episodes": 0}, {"max_steps": 0}, {"episodes": 1.5}, {"max_steps": True}])

@@ -259,6 +259,15 @@ def test_states_that_single_precision_cannot_hold_are_refused(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_positions_that_single_precision_cannot_tell_apart_are_refused(tmp_path: Path):
+    near, far = episode(3), episode(4)
+    states = far.states.copy()
+    states[..., 1] -= 5_400_000.0
+    with pytest.raises(UserError, match=r"store, episode seed 4: y_m lies up to 54000[.\d]* .* steps of 0.5; "):
+        write_store(tmp_path / "store", INFO, [near, replace(far, states=states)])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_non_finite_states_in_a_store_are_refused_with_their_place(tmp_path: Path):
     write_store(tmp_path / "store", INFO, [episode(1), episode(3)])
     states: Any = zarr.open_group(tmp_path / "store", mode="r+")["states"]

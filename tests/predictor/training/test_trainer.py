@@ -242,7 +242,7 @@ def test_validation_stores_are_used_as_they_are(circles: Path, tmp_path: Path):
 
 def test_a_checkpoint_sees_as_many_agents_as_the_largest_of_its_stores(circles: Path, tmp_path: Path):
     larger = replace(spec(), max_agents=spec().max_agents + 5)
-    write_store(tmp_path / "larger", StoreInfo(larger, "larger"), [circling_episode(i) for i in range(6)])
+    write_store(tmp_path / "larger", StoreInfo(larger, "larger"), [circling_episode(i) for i in range(50, 56)])
     both = replace(config(circles, tmp_path), data=(circles, tmp_path / "larger"))
     assert load_data(both).spec == larger
     validated = config(circles, tmp_path, val_data=(tmp_path / "larger",))
@@ -274,6 +274,20 @@ def test_no_episode_of_a_store_validates_what_another_trains(circles: Path, tmp_
     trained = load_data(replace(begun, data=(tmp_path / "idle", tmp_path / "random"))).train_episodes
     idle, random = ({e.seed for e in trained if e.label == label} for label in ("idle", "random"))
     assert random == idle & set(range(12)) and 0 < len(random) < 8  # 4 of 12 are held out, and others of the 15
+
+
+def test_no_recording_validates_what_it_trains(circles: Path, tmp_path: Path):
+    """A file that was cut into episodes of another length has the same scenes."""
+    whole = circling_episode(3, steps=12)
+    stretch = replace(whole, states=whole.states[4:], valid=whole.valid[4:], seed=0)
+    for name, episodes in (("val", [circling_episode(40), stretch]), ("other", [circling_episode(40)])):
+        write_store(tmp_path / name, StoreInfo(spec(), "files", {"split": name}), episodes)
+    write_store(tmp_path / "train", StoreInfo(spec(), "files", {"split": "train"}), [whole, circling_episode(9)])
+    begun = replace(config(circles, tmp_path), data=(tmp_path / "train",))
+    said = r"val \(val_data\) has 8 of its \d+ scenes in common with .*train: the same recording; make it from other"
+    with pytest.raises(UserError, match=said):
+        load_data(replace(begun, val_data=(tmp_path / "val",)))
+    assert len(load_data(replace(begun, val_data=(tmp_path / "other",))).val) == 1
 
 
 @pytest.mark.parametrize("recordings", [6, 5])
@@ -334,7 +348,7 @@ def test_validation_stores_must_fit(circles: Path, tmp_path: Path):
 @pytest.mark.parametrize("given", [False, True], ids=["held_out", "given"])
 def test_training_episodes_can_be_limited(circles: Path, tmp_path: Path, given: bool):
     """The first ones of each training store; validation is what it was."""
-    write_circles(tmp_path / "val", episodes=3)
+    write_store(tmp_path / "val", StoreInfo(spec(), "circles"), [circling_episode(i) for i in range(70, 73)])
     changes = {"val_data": (tmp_path / "val",)} if given else {}
     everything, few = (load_data(config(circles, tmp_path, max_episodes=n, **changes)) for n in (0, 2))
     assert [e.seed for e in few.train_episodes] == [e.seed for e in everything.train_episodes][:2]
@@ -370,7 +384,7 @@ def test_weights_of_labels_need_labels(circles: Path, tmp_path: Path, option: st
         "edge_types": np.zeros((1, 2, 2), dtype=np.int8),
         "edge_attributes": np.zeros((1, 2, 2, 1), dtype=np.float32),
     }
-    episodes = [replace(circling_episode(i), **{needed: labels[needed]}) for i in range(3)]
+    episodes = [replace(circling_episode(i), **{needed: labels[needed]}) for i in range(70, 73)]
     write_store(tmp_path / "labelled", StoreInfo(spec(), "labelled"), episodes)
     fine = config(tmp_path / "labelled", tmp_path / "run", val_data=(circles,), **{option: 1.0})
     assert len(load_data(fine).train_episodes) == 3

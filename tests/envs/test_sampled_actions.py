@@ -2,7 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.drivers.sampled_actions import uniform_action, varied_actions
+from envs.sampled_actions import uniform_action, varied_actions
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Actions chosen from an action space alone, for drivers of an ego and drivers of all agents."""
+"""Actions chosen from an action space alone, for drivers of an ego, drivers of all agents, and partners."""
 
 import copy
 from collections.abc import Callable
@@ -15,13 +15,14 @@ OWN_DRIVER = "drive it with one of your own, own:module:function (docs/wrap_your
 """What to do where no driver knows the actions."""
 
 
-def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
+def uniform_action(space: gym.Space, rng: np.random.Generator, who: str, advice: str = OWN_DRIVER) -> Any:
     """Returns an action drawn uniformly.
 
     Args:
         space: Discrete, MultiDiscrete, MultiBinary or a bounded Box.
         rng: source of the draw.
         who: name of the drivers, for the message.
+        advice: what to do about another space, for the message.
 
     Raises:
         UserError: another space.
@@ -38,7 +39,7 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
         return np.asarray(rng.uniform(space.low, space.high), dtype=space.dtype)
     require_space(space, "the action space")
     raise UserError(
-        f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}; {OWN_DRIVER}"
+        f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}; {advice}"
     )
 
 
