@@ -109,8 +109,9 @@ class TrainPolicyConfig:
     success_key: str | None = None
     """Key of the infos that says whether the ego has succeeded; None takes the registered one or is_success."""
     steps: int | None = None
-    """Number of environment steps to train for, over all environments; one step of a PettingZoo copy is one, however
-    many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 60,000."""
+    """Number of environment steps to train for, over all environments, rounded up to whole updates of the algorithm.
+    One step of a PettingZoo copy is one, however many agents learn. None takes 20,000, in mpe2's particle worlds
+    (simple_tag_v3) 60,000."""
     num_envs: int | None = None
     """Number of parallel environments: processes, environments of EnvPool, or copies of a PettingZoo environment. None
     takes 6, with EnvPool and in mpe2's particle worlds 64."""

@@ -306,7 +306,8 @@ def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
     zipped = policy_zip(local_policy(policy, config.trust_pickle))
     if (zipped.parent / CONFIG_FILE).is_file():  # of which nothing is imported that the command does not name
         run = read_config(zipped.parent, "observe", "algorithm")
-        algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
+        algorithm, where = run["algorithm"], str(zipped.parent / CONFIG_FILE)
+        task = task_of(run, config.device, config.env_id, config.checkpoint, where)
         require_env_of(zipped, task)
     else:
         algorithm, task = algorithm_of(zipped), task_of_policy(zipped, config.device)

@@ -188,7 +188,7 @@ def task_of_policy(path: str | Path, device: str = "cpu", sized: bool = True) ->
     if (zipped.parent / CONFIG_FILE).is_file():
         pin = None if note is None else note.forecaster
         named = (None if note is None else note.env_id, None if pin is None else pin.checkpoint)
-        task = task_of(read_config(zipped.parent), device, *named)
+        task = task_of(read_config(zipped.parent), device, *named, where=str(zipped.parent / CONFIG_FILE))
         require_env_of(zipped, task)
         return task
     if note is None or not note.env_id:

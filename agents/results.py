@@ -30,6 +30,8 @@ PACKAGES = (
     *("torch", "numpy"),
 )
 """Packages whose versions the provenance names."""
+FEW_EPISODES = 20
+"""Number of episodes below which a table says that its bootstrap intervals are too narrow."""
 MOST_EPISODES = 10_000
 """Largest number of episodes of a policy in a summary.json that is read."""
 NOT_REPORTED = "not reported"
@@ -165,6 +167,8 @@ class Evaluation:
         if not lines:
             return []
         told = f"Differences: mean over the same seeds, 95 % bootstrap over episodes ({DRAWS:,} draws)."
+        if min(map(len, self.results.values())) < FEW_EPISODES:
+            told += f" Intervals of fewer than {FEW_EPISODES} episodes are too narrow."
         return [TablePart(["policy", f"return − return of {self.reference} (95 %)"], lines, told)]
 
 

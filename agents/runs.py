@@ -28,7 +28,7 @@ from envs.sb3.algorithms import algorithm_of_model
 from envs.sb3.policy_file import FORECASTER, ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.support.errors import UserError
 from predictor.support.files import check_out, check_place, delete_leftovers, new_file, write_json
-from predictor.support.reading import NoSuchFile, read_json
+from predictor.support.reading import NoSuchFile, damage_in, read_json
 from predictor.support.typed_values import converted
 
 CONFIG_FILE = "config.json"
@@ -43,6 +43,7 @@ LARGEST = 1e30
 """Largest size of a number in a learning curve; larger ones cannot be drawn."""
 
 _BUFFER_ENTRY = "replay_buffer.pkl"
+_WITHOUT_CONFIG = "move it away to use the run's policy.zip alone, or train anew in another folder"
 
 
 def open_run(
@@ -219,7 +220,7 @@ def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, dev
     found = algorithm_of(path)
     if found != algorithm:
         raise UserError(
-            f"{path} is a {found} policy, where a {algorithm} one is expected; take the file of its own run"
+            f"{path} holds a policy of {found}, where one of {algorithm} is expected; take the file of its own run"
         )
     model = load_policy(path, venv, device)
     with zipfile.ZipFile(path) as archive:
@@ -252,12 +253,14 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         content = read_json(file)
     except NoSuchFile as error:
-        raise UserError(f"{file.parent} holds no training run ({file.name} is missing)") from error
+        raise UserError(
+            f"{file.parent} holds no training run ({file.name} is missing); name the folder of one, or a .zip"
+        ) from error
     except UserError as error:
-        raise UserError(f"{file} is not a run's config: {error}") from error
+        raise UserError(f"{file} is damaged ({damage_in(file, error)}); {_WITHOUT_CONFIG}") from error
     config = content.get("config") if isinstance(content, dict) else None
     if not isinstance(config, dict) or "env_id" not in config:  # a predictor's run has none
-        raise UserError(f"{file} is not the config of a policy's run")
+        raise UserError(f"{file} is not the config of a policy's run; {_WITHOUT_CONFIG}")
     for name, kind in (("env_id", str), ("observe", str), ("algorithm", Algorithm)):
         if name in config:
             converted(config[name], kind, f"{file}: {name}")

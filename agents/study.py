@@ -8,7 +8,7 @@ never runs a finished cell again. The folder then holds report.html, report.md, 
 import itertools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,8 +107,9 @@ def run_study(config: StudyConfig) -> int:
         for task_id in filter(begins_alike, sorted(copies)):
             print(f"note: EnvPool's {task_id} begins every training episode in the same state; the original does not")
         failed = _run_missing(config, folder, chosen, results, len(cells))
-        done = [results[cell.name] for cell in cells if cell.name in results]
-        _write(config, folder, study, done, text, [cell for cell, _ in failed], len(cells))
+        done = _in_order(study, [results[cell.name] for cell in cells if cell.name in results])
+        not_run = _counted(len(cells) - len(done) - len(failed), "cell")
+        _write(config, folder, study, done, text, [cell for cell, _ in failed], not_run)
     for cell, reason in failed:
         log = folder / CELLS / cell.name / LOG_FILE
         print(f"failed: {cell.title}: {reason}; its log is {log}", file=sys.stderr)
@@ -187,7 +188,7 @@ def _report_only(config: StudyConfig, folder: Path, study: Study, text: str) -> 
         _keep_file(folder, text)
         trained = sum(result.algorithm is not None for result in results)
         to_train = len(study.scenarios) * len(study.arms) * len(study.algorithms) * len(study.training_seeds)
-        _write(config, folder, study, results, text, (), len(results) - trained + to_train)
+        _write(config, folder, study, results, text, (), _counted(to_train - trained, "training"))
     return 0
 
 
@@ -200,21 +201,33 @@ def _all_results(folder: Path, study: Study) -> list[Result]:
         UserError: one of them is damaged.
     """
     ids = {scenario.name: scenario.env_id for scenario in study.scenarios}  # a scenario's may have changed
-    every = [read_result(file) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
+    advice = "move it away for a report of the others; the command without --report measures its cell anew"
+    every = [read_result(file, advice) for file in sorted((folder / CELLS).glob(f"*/{RESULT_FILE}"))]
     found = [each for each in every if each.env_id == ids.get(each.scenario)]
     fitting = [each for each in found if _has_settings_of(each, study)]
     if len(fitting) < len(found):
         others = len(found) - len(fitting)
         print(f"left out: {others} results of other settings than {study.name}'s file has now", file=sys.stderr)
         found = fitting
-    latest = {
-        (each.scenario, each.arm, each.algorithm, each.seed): each
-        for each in sorted(found, key=lambda each: str(each.provenance.get("time")))
-    }
-    drivers = list(dict.fromkeys((each.arm, None, None) for each in found if each.algorithm is None))
+    return _in_order(study, sorted(found, key=lambda each: str(each.provenance.get("time"))))
+
+
+def _in_order(study: Study, results: Iterable[Result]) -> list[Result]:
+    """Returns the results of the study's drivers and arms in the order of its file; of two of one cell the later."""
+    latest = {(each.scenario, each.arm, each.algorithm, each.seed): each for each in results}
+    drivers = {arm for _, arm, algorithm, _ in latest if algorithm is None}
     arms = list(itertools.product([arm.name for arm in study.arms], study.algorithms, study.training_seeds))
-    cells = ((scenario.name, *line) for scenario in study.scenarios for line in (*drivers, *arms))
+    cells = [
+        (scenario.name, *line)
+        for scenario in study.scenarios
+        for line in (*((name, None, None) for name in scenario.references_among(drivers)), *arms)
+    ]
     return [latest[cell] for cell in cells if cell in latest]
+
+
+def _counted(number: int, what: str) -> str:
+    """Returns a number of things as text; empty for none."""
+    return f"{number} {what}{'s' * (number > 1)}" if number else ""
 
 
 def _has_settings_of(result: Result, study: Study) -> bool:
@@ -256,13 +269,13 @@ def _notes(
 
 def _write(
     config: StudyConfig, folder: Path, study: Study, results: Sequence[Result], text: str, failed: Sequence[Cell],
-    total: int,
+    not_run: str,
 ) -> None:  # fmt: skip
-    """Writes what the study found, and says where."""
+    """Writes what the study found, and says where; `not_run` says how many cells are not run yet, empty for none."""
     if not results:
         return
     findings, made = Findings.of(study, results), provenance(PACKAGES)
-    titles, not_run = [cell.title for cell in failed], total - len(results) - len(failed)
+    titles = [cell.title for cell in failed]
     if config.headroom:
         print(write_headroom(folder, findings, made, titles, not_run))
         print(f"written to {folder / HEADROOM}")

@@ -310,7 +310,11 @@ _OWN_PACKAGES = ("highway_env.", "envs.")
 
 
 def task_of(
-    run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None, trusted_forecaster: str | None = None
+    run: Mapping[str, Any],
+    device: str = "cpu",
+    trusted: str | None = None,
+    trusted_forecaster: str | None = None,
+    where: str = "the run's config",
 ) -> Task:
     """Returns the task of a training run.
 
@@ -319,11 +323,12 @@ def task_of(
         device: device that runs the forecaster.
         trusted: id of an environment that may be imported ("module:Id"); a run's config alone imports nothing.
         trusted_forecaster: forecaster of a user's own that may be imported ("own:module:function").
+        where: file of the config, for messages.
 
     Raises:
         UserError: the config does not fit this version, names what is missing, or would import code.
     """
-    hints, where = get_type_hints(Task), "the run's config"
+    hints = get_type_hints(Task)
     for name in ("env_id", "observe", "checkpoint"):
         if name not in run:
             raise UserError(f"{where}: key '{name}' is missing")
@@ -347,7 +352,10 @@ def task_of(
                 f"the run's checkpoint would be fetched from '{short(named, 80)}'; if you trust it, name it yourself "
                 f"with --checkpoint {short(named, 80)}"
             )
-    task = Task(device=device, **values)
+    try:
+        task = Task(device=device, **values)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
     for text in _texts_of(task.make_kwargs):
         if re.search(r"[.:]", text) and not text.startswith(_OWN_PACKAGES):  # highway-env imports what is before a dot
             raise UserError(

@@ -34,7 +34,7 @@ from agents.summaries import mean_of_known
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
-from envs.sb3.policy_file import PolicyNote, read_note, selection_return
+from envs.sb3.policy_file import PolicyNote, check_whole, read_note, selection_return
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file, write_json
@@ -210,6 +210,7 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
         model = make_model(plan, venv, logs)
         _seed_from_steps(plan, model)
         return model
+    check_whole(checkpoint, f"remove it to train anew; copy {BEST_FILE} first, if it is there: the best policy so far")
     model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
     _seed_from_steps(plan, model)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 HEURISTIC_DRIVERS = ("heuristic", "mixed", "varied")
 """Drivers of the multiagent environments that `envs.drivers.all_agents` has a heuristic for."""
+_EXAMPLE = """write '{"config": {"vehicles_count": 20}}'"""
 _OF_GYMNASIUM = ("disable_env_checker", "render_mode")
 """Arguments of `make_env` that are not a user's."""
 _REFUSALS = (TypeError, ValueError, AssertionError, ImportError)
@@ -149,11 +150,9 @@ def arguments_of(text: str) -> dict[str, Any]:
         kwargs = parse_json(text or "{}", "env_kwargs")
     except UserError as error:
         why = str(error).removesuffix("; get it anew")
-        raise UserError(
-            f"env_kwargs must be a JSON object, got {short(repr(text))}: {why}; write '{{\"lanes\": 2}}'"
-        ) from error
+        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}: {why}; {_EXAMPLE}") from error
     if not isinstance(kwargs, dict):
-        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}")
+        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}; {_EXAMPLE}")
     if "env_id" in kwargs or "id" in kwargs:
         raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
     for name in _OF_GYMNASIUM:

@@ -37,7 +37,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--data absent --out new --steps -1", "steps must be at least 1, got -1"),
         ("--data absent --out new --likelihood gausian", "invalid choice 'gausian' for argument '--likelihood'"),
         ("--data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
-        ("--data absent --out new --seed 1.5", "--seed: invalid literal for int()"),
+        ("--data absent --out new --seed 1.5", "--seed must be a whole number, got '1.5'"),
     ],
     "predictor.evaluate": [
         ("--checkpoint absent --data absent", "no checkpoint 'absent'"),

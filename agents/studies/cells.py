@@ -12,6 +12,7 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -219,11 +220,10 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
         raise UserError(f"{place}: {error}") from error
     try:
         if task.is_multiagent:
-            many = task.make()
-            many.reset(seed=0)
-            for name in names:
-                make_driver(name, many, np.random.default_rng(0))
-            many.close()
+            with closing(task.make()) as many:
+                many.reset(seed=0)
+                for name in names:
+                    make_driver(name, many, np.random.default_rng(0))
         else:
             names = checked_drivers(task, names)
         said = study.settings_of(scenario)

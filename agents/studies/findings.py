@@ -176,6 +176,11 @@ class Findings:
             scaled.append((self.runs(scenario, line) - low) / width)
         return scaled
 
+    def even_runs(self, line: Line) -> Runs:
+        """Returns rescaled scores of as many runs of each scenario, the first ones, so that all weigh the same."""
+        scaled = self.scaled_runs(line, self.scenarios)
+        return [scores[: min(map(len, scaled))] for scores in scaled]
+
     def common_lines(self) -> tuple[Line, ...]:
         """Returns the arms with results in every scenario."""
         return tuple(x for x in self.lines(trained=True) if all((s, x) in self.results for s in self.scenarios))

@@ -127,7 +127,7 @@ def profiles(findings: Findings) -> str:
         ax.set_xlabel("return τ")
     if several:
         lines = findings.common_lines()
-        scaled = {line: findings.scaled_runs(line, findings.scenarios) for line in lines}
+        scaled = {line: findings.even_runs(line) for line in lines}
         _profile_panel(axes[-1], findings, scaled, "all scenarios")
         axes[-1].set_xlabel("rescaled score τ")
     axes[0].set_ylabel("share of runs above τ")

@@ -3,8 +3,9 @@
 `docs/study.md` explains every key. A file that ships is named by its stem ("quick"), any other one by its path.
 """
 
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -83,6 +84,13 @@ class Scenario:
         """Checks ranges."""
         check_at_least(self, 1, "steps", "num_envs")
         check_memory(self.num_envs * ENV_BYTES, f"num_envs={self.num_envs:,}", "take fewer")
+
+    def references_among(self, drivers: Iterable[str]) -> list[str]:
+        """Returns those drivers that are references of the scenario, in its order; constant actions by their names."""
+        there = sorted(set(drivers))
+        constant = [each for each in there if is_constant(each) and not is_planner(each)]
+        named = (constant if name == CONSTANT_ACTIONS else [name] for name in self.references)
+        return [each for each in dict.fromkeys(itertools.chain.from_iterable(named)) if each in there]
 
 
 @dataclass(frozen=True)

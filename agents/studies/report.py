@@ -21,7 +21,7 @@ NOTHING = "–"
 
 
 def write_report(
-    folder: Path, findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: int = 0
+    folder: Path, findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: str = ""
 ) -> None:
     """Writes the report as Markdown, with its pictures beside it, and as one HTML page.
 
@@ -31,7 +31,7 @@ def write_report(
         text: the study file.
         provenance: provenance of this start.
         failed: names of the cells that failed.
-        not_run: number of cells that were not asked for, and have no result of before.
+        not_run: how many cells were not asked for and have no result of before, as text; empty for none.
     """
     blocks = blocks_of(findings, text, provenance, failed, not_run)
     for block in blocks:
@@ -42,7 +42,7 @@ def write_report(
 
 
 def write_headroom(
-    folder: Path, findings: Findings, provenance: dict[str, Any], failed: Sequence[str] = (), not_run: int = 0
+    folder: Path, findings: Findings, provenance: dict[str, Any], failed: Sequence[str] = (), not_run: str = ""
 ) -> str:
     """Writes the headroom table with what it took, and returns it as Markdown; arguments as of `write_report`."""
     found = [*_standing(findings, failed, not_run), *_headroom(findings), *_times(findings)]
@@ -57,7 +57,7 @@ def title_of(findings: Findings) -> str:
 
 
 def blocks_of(
-    findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: int = 0
+    findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: str = ""
 ) -> list[Block]:
     """Returns the blocks of the report; what differs between two runs of one study stands at its end."""
     study = findings.study
@@ -84,13 +84,13 @@ def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str 
     return value.replace("-", "−")
 
 
-def _standing(findings: Findings, failed: Sequence[str], not_run: int) -> list[Block]:
+def _standing(findings: Findings, failed: Sequence[str], not_run: str) -> list[Block]:
     """Returns what the numbers are made of, and which cells they lack."""
     blocks: list[Block] = [Paragraph(_summary(findings))]
     if failed:
         blocks.append(Paragraph(f"Without a result: {'; '.join(failed)}. The numbers below are of the others."))
     if not_run:
-        blocks.append(Paragraph(f"Not run yet: {not_run} cells of the study. The numbers below are of the others."))
+        blocks.append(Paragraph(f"Not run yet: {not_run} of the study. The numbers below are of the others."))
     return blocks
 
 
@@ -107,10 +107,11 @@ def _summary(findings: Findings) -> str:
         f"{_span(seeds)} training {'seed' if seeds == {1} else 'seeds'} per arm; {episodes} test episodes per "
         "policy and driver, on seeds that are the same for all and that neither training nor selection uses. A run is "
         "one training; its score is its mean return over these episodes. Intervals are 95 %: Student's for means over "
-        "runs, Welch's for differences of two of them, percentiles of a bootstrap over runs for everything else; the "
-        "latter are too narrow for few runs (that of a mean of five holds the truth in 83 % of cases). Drivers are not "
-        "trained: their intervals are over episodes (of crash rates Wilson's) and cannot be compared with those over "
-        "runs." + _unequal(findings)
+        "runs, Welch's for differences of two of them in one scenario, percentiles of a bootstrap over runs for "
+        "everything else; the latter are too narrow for few runs (that of a mean of five holds the truth in 83 % of "
+        "cases). Where all runs score the same, an interval has no width, which says nothing of further runs. Drivers "
+        "are not trained: their intervals are over episodes (of crash rates Wilson's) and cannot be compared with "
+        f"those over runs. {NOTHING} stands for what there is not, as the runs of a driver." + _unequal(findings)
     )
 
 
@@ -223,10 +224,13 @@ def _return_of(findings: Findings, scenario: str, line: Line | None) -> str:
 def _all_scenarios(findings: Findings) -> list[Block]:
     lines = []
     for line in findings.common_lines():
-        runs = findings.scaled_runs(line, findings.scenarios)
+        runs = findings.even_runs(line)
         middle = findings.estimate(interquartile_mean, runs, about=("all", *line))
         lines.append([findings.label(line), str(sum(len(found) for found in runs)), interval(middle)])
-    told = "Rescaled scores: 0 is the lowest and 1 the highest mean return of any line of the scenario's table."
+    told = (
+        "Rescaled scores: 0 is the lowest and 1 the highest mean return of any line of the scenario's table. Of each "
+        "arm as many runs of each scenario count, the first ones."
+    )
     table = Table(["policy", "runs", "interquartile mean of rescaled scores"], lines)
     return [Heading("All scenarios"), Paragraph(told), table]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from predictor.support.errors import UserError
 from predictor.support.files import finite, new_file, write_json
-from predictor.support.reading import MIB, read_object
+from predictor.support.reading import MIB, damage_in, read_object
 from predictor.support.typed_values import from_table
 
 RESULT_FILE = "result.json"
@@ -18,6 +18,10 @@ EPISODES_FILE, CURVES_FILE = "episodes.parquet", "curves.parquet"
 MOST_BYTES = 1024 * MIB
 """Largest size of a result."""
 _DIGEST = "sha256"
+MEASURED_ANEW = (
+    "delete this file and run the same command again: all other cells are kept, and this one is measured anew"
+)
+"""What to do with a damaged result while a study runs."""
 _RENAMED = {"seed": "episode_seed", "episode_return": "return"}
 """Field of an episode → its column, where the name alone would be misread."""
 
@@ -56,8 +60,12 @@ def write_result(path: Path, result: Result) -> None:
     write_json(path, content | {_DIGEST: _digest(content)})
 
 
-def read_result(path: Path) -> Result:
+def read_result(path: Path, advice: str = MEASURED_ANEW) -> Result:
     """Reads a result.
+
+    Args:
+        path: path of the file.
+        advice: what to do if it is damaged, for the message.
 
     Raises:
         UserError: the file is damaged; the message says what to do.
@@ -68,10 +76,7 @@ def read_result(path: Path) -> Result:
             raise UserError(f"its content does not have the hash ({_DIGEST}) that it was written with")
         return from_table(Result, content, "its content")
     except UserError as error:
-        raise UserError(
-            f"{path} is damaged ({error}); delete this file and run the same command again: all other cells are kept, "
-            "and this one is measured anew"
-        ) from error
+        raise UserError(f"{path} is damaged ({damage_in(path, error)}); {advice}") from error
 
 
 def write_tables(folder: Path, results: Sequence[Result]) -> None:

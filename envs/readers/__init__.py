@@ -114,7 +114,7 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
     raise UserError(
         f"no scene reader knows {type(env.unwrapped).__name__}; pass reader= (FunctionReader for a function "
         "read(env) -> Scene, EntityRowsReader for observations whose rows are entities, or an own Reader), or call "
-        "register_reader for its class; see docs/wrap_your_env.md"
+        "register_reader for its class; see docs/wrap_your_env.md, or do without forecasts (--observe none)"
     )
 
 

@@ -99,7 +99,13 @@ class ForecasterPin:
                 f"{policy} was trained on forecaster {self._named}, but gets {found._named}; pass the checkpoint it "
                 "was trained on, or train a policy on this one"
             )
-        for name in ("arm", "horizon_steps", "num_samples", "num_plans", "max_agents", "perception_m"):
+        if self.num_plans != found.num_plans:
+            raise UserError(
+                f"{policy} was trained with {self.num_plans} candidate plans of the ego, but here there are "
+                f"{found.num_plans}; give the environment the actions that it was trained with (env_kwargs), or train "
+                "a policy on these plans"
+            )
+        for name in ("arm", "horizon_steps", "num_samples", "max_agents", "perception_m"):
             if getattr(self, name) != getattr(found, name):
                 raise UserError(
                     f"{policy} was trained on forecasts with {name}={getattr(self, name)}, but gets "
@@ -181,15 +187,35 @@ def selection_return(best: Path) -> float:
     Raises:
         UserError: the file is damaged.
     """
-    try:
-        found: float = read_note(best).get("selection_return", -math.inf)
-        if best.exists():
-            with zipfile.ZipFile(best) as file:
-                if (part := file.testzip()) is not None:
-                    raise zipfile.BadZipFile(f"{part} differs from its checksum")
-    except (zipfile.BadZipFile, *_DAMAGED) as error:
-        raise UserError(f"{best} is damaged; remove it to go on without it") from error
+    if not os.path.lexists(best):
+        return -math.inf
+    check_whole(best, "remove it to go on without it")
+    found: float = read_note(best).get("selection_return", -math.inf)
     return found
+
+
+def check_whole(path: Path, advice: str) -> None:
+    """Checks that a zip is as it was written.
+
+    A zip of SB3 holds its weights as a zip of their own. Where it is cut soon after these, what is left looks like that
+    inner zip, all of whose checksums are right; only that it does not begin where the file does tells them apart.
+
+    Args:
+        path: path of the zip.
+        advice: what to do, for the message.
+
+    Raises:
+        UserError: it is no zip, was cut, or an entry differs from its checksum.
+    """
+    check_regular(path, MOST_BYTES)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if min((part.header_offset for part in archive.infolist()), default=1):
+                raise zipfile.BadZipFile("the archive does not begin with the file")
+            if (name := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(f"{name} differs from its checksum")
+    except (zipfile.BadZipFile, *_DAMAGED) as error:
+        raise UserError(f"{path} is damaged; {advice}") from error
 
 
 def read_policy_note(path: Path) -> PolicyNote | None:
@@ -248,16 +274,14 @@ def algorithm_of(path: Path) -> Algorithm:
     """Returns the algorithm that the note inside a zip names; without one, it is decided by the parameters.
 
     Raises:
-        UserError: no such file, or a policy of no known algorithm.
+        UserError: no such file, one that is damaged, or a policy of no known algorithm.
     """
     if not os.path.lexists(path):
         raise UserError(f"no policy at {path}; train one with python train_policy.py")
-    try:
-        parameters = _entry(path, "data")
-        known = parameters if isinstance(parameters, dict) else {}
-        found = algorithm_named(_note(path).get(_ALGORITHM_KEY)) or algorithm_of_parameters(known)
-    except zipfile.BadZipFile:
-        found = None
+    check_whole(path, "copy it again, or name another .zip of its run")
+    parameters = _entry(path, "data")
+    known = parameters if isinstance(parameters, dict) else {}
+    found = algorithm_named(_note(path).get(_ALGORITHM_KEY)) or algorithm_of_parameters(known)
     if found is None:
         raise UserError(f"{path} holds no policy of {', '.join(get_args(Algorithm))}")
     return found

@@ -28,6 +28,14 @@ HELP_ALL = "--help-all"
 
 _SENTENCE_TITLES = ("Invalid choice", "Missing argument", "Value error")
 """Titles of tyro's boxes whose first part is a sentence; the other boxes list options and stay as they are."""
+_UNKNOWN = "Unrecognized options"
+_NOT_A_NUMBER = (
+    (r"no type matching \{None\}\|INT could be instantiated from \['(.*)'\]\.?", "a whole number"),
+    (r"no type matching \{None\}\|FLOAT could be instantiated from \['(.*)'\]\.?", "a number"),
+    (r"invalid literal for int\(\) with base 10: '(.*)'", "a whole number"),
+    (r"could not convert string to float: '(.*)'", "a number"),
+)
+"""Sentences of tyro and of Python about a word that is no number, and what it has to be."""
 
 
 def parse(config_class: type[Config], description: str | None = None, args: Sequence[str] | None = None) -> Config:
@@ -42,9 +50,9 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         args: words of the command line; None takes those of this process.
 
     Raises:
-        UserError: the config rejects a value, a value does not have its field's type, or an option that takes several
-            values is given twice.
-        SystemExit: options are unknown or missing (status 2, listed on stderr), or help is asked for (status 0).
+        UserError: the config rejects a value, a value does not have its field's type, an option is unknown, or one that
+            takes several values is given twice.
+        SystemExit: options are missing (status 2, listed on stderr), or help is asked for (status 0).
     """
     words = sys.argv[1:] if args is None else list(args)
     if HELP_ALL in words:
@@ -123,12 +131,24 @@ def _user_error_behind(error: BaseException | None) -> UserError | None:
 def _sentence_in(box: str) -> str:
     """Returns the sentence in a box of tyro, without the frame; empty for a box that lists options."""
     lines = re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
-    if not lines or lines[0].strip("╭─╮+- ") not in _SENTENCE_TITLES:
-        return ""
+    title = lines[0].strip("╭─╮+- ") if lines else ""
     inside = [line.strip("│ ") for line in lines[1:]]
     after_title = itertools.dropwhile(_is_rule, inside)
-    sentence = itertools.takewhile(lambda line: not _is_rule(line), after_title)
-    return " ".join(sentence).removeprefix("Error parsing ")
+    sentence = " ".join(itertools.takewhile(lambda line: not _is_rule(line), after_title))
+    if title == _UNKNOWN:
+        options = (re.match(r"[│ ] {5}(--\S+)", line) for line in lines)  # their help is further in
+        similar = [option[1] for option in options if option]
+        meant = f"did you mean {' or '.join(similar)}? " if similar else ""
+        return f"unknown options: {sentence.removeprefix(_UNKNOWN + ': ')}; {meant}--help lists those that there are"
+    return _plainly(sentence.removeprefix("Error parsing ")) if title in _SENTENCE_TITLES else ""
+
+
+def _plainly(sentence: str) -> str:
+    """Returns a sentence on a wrong word in ours, if it is that the word is no number."""
+    for pattern, wanted in _NOT_A_NUMBER:
+        if found := re.fullmatch(rf"(\S+): {pattern}", sentence):
+            return f"{found[1]} must be {wanted}, got {found[2]!r}"
+    return sentence
 
 
 def _is_rule(line: str) -> bool:

@@ -1,6 +1,7 @@
 """Typed values from JSON and TOML: an object becomes a dataclass, and what does not fit is named by its key."""
 
 import dataclasses
+import difflib
 import math
 import types
 from collections.abc import Mapping
@@ -34,7 +35,9 @@ def from_table(kind: type[Table], table: Any, where: str, given: Mapping[str, An
     hints = get_type_hints(kind)
     for key in table:
         if key not in known:
-            raise UserError(f"{where}: unknown key '{short(key, _MOST_SHOWN)}'; there are {', '.join(known)}")
+            similar = difflib.get_close_matches(str(key), known, 1)
+            meant = f"did you mean {similar[0]}? There are" if similar else "there are"
+            raise UserError(f"{where}: unknown key '{short(key, _MOST_SHOWN)}'; {meant} {', '.join(known)}")
     for name, field in known.items():
         has_default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
         if name not in table and not has_default:

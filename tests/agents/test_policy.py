@@ -167,7 +167,7 @@ def test_another_forecaster_is_refused(of_one_ego: bool, tmp_path: Path):
         ),
         ("empty", "empty holds no training run \\(config.json is missing\\)"),
         ("stopped", "stopped holds no policy.zip: its training has not ended; continue it with --resume, or name one"),
-        ("text.zip", "text.zip (is neither a PPO nor a DQN policy|holds no policy of)"),
+        ("text.zip", "text.zip is damaged; copy it again, or name another .zip of its run"),
         ("predictor", "config.json is not the config of a policy's run"),
     ],
 )

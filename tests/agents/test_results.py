@@ -180,6 +180,9 @@ def test_differences_stand_in_both_files(tmp_path: Path):
         "reference": "slower",
         "policies": {"ppo": {"value": 2.0, "interval": [2.0, 2.0]}},
     }
+    assert text.rstrip().endswith("(10,000 draws). Intervals of fewer than 20 episodes are too narrow.")
+    many = [replace(EPISODES[0], seed=10 + i, episode_return=float(i)) for i in range(20)]
+    assert "too narrow" not in Evaluation("toy-v0", 10, {"ppo": many, "slower": many}).markdown()
     single = Evaluation("toy-v0", 10, {"ppo": EPISODES[:1], "slower": slower[:1]}).markdown()
     assert "| ppo | +2.00 |" in single
     assert "return − return" not in Evaluation("toy-v0", 10, {"ppo": EPISODES}).markdown()

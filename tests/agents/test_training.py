@@ -268,6 +268,21 @@ def test_a_best_model_with_a_wrong_byte_does_not_replace_the_policy(tmp_path: Pa
         assert policy.read_bytes() == good
 
 
+def test_a_damaged_checkpoint_says_what_to_do_and_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: PPOPreset(n_steps=8, batch_size=8, n_epochs=1))
+    training = plan(steps=16, selections=1, selection_episodes=1, selection_envs=1, in_process=True)
+    train(training, tmp_path)
+    checkpoint = tmp_path / "checkpoint.zip"
+    save_model(make_ppo(), checkpoint, to_continue=True)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:500])
+    before = {file: file.read_bytes() for file in tmp_path.glob("*.zip")}
+    with pytest.raises(
+        UserError, match="checkpoint.zip is damaged; remove it to train anew; copy best_model.zip first"
+    ):
+        train(training, tmp_path)
+    assert {file: file.read_bytes() for file in tmp_path.glob("*.zip")} == before
+
+
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
 

@@ -142,7 +142,7 @@ def test_what_the_file_says_of_a_cell_is_what_changes_its_result(tmp_path: Path)
             "a name is part of a folder's and has at most 64 signs, got 65",
         ),
         (study_text(arms='[{name = "a/b", observe = "none"}]'), "a name has letters, digits, - and _ alone, got 'a/b'"),
-        (study_text(step="3"), "corridor.toml: unknown key 'step'; there are title, algorithms, seeds, steps"),
+        (study_text(step="3"), "corridor.toml: unknown key 'step'; did you mean steps\\? There are title, algorithms,"),
         (study_text(steps="0"), "corridor.toml: steps must be at least 1, got 0"),
         (study_text(steps='"many"'), "corridor.toml: steps must be a whole number, got 'many'"),
         (study_text(episodes="20000"), "corridor.toml: episodes must be at most 10,000, got 20000"),

@@ -137,6 +137,20 @@ def test_scores_of_several_scenarios_are_rescaled():
     assert [float(np.mean(runs)) for runs in scaled] == pytest.approx([3 / 8, 5 / 8]), "2 is the lowest, 10 the highest"
 
 
+def test_scenarios_weigh_the_same_where_their_runs_are_pooled(tmp_path: Path):
+    """One more seed in one of them with the mean of its others moved the interquartile mean over both."""
+    more = [result("forecast", [6.0, 8.0], seed, "two") for seed in (3, 4)]
+    findings = found_in(study(("one", "two")), results() + results("two", lift=2.0) + more)
+    assert [len(runs) for runs in findings.scaled_runs(SEEN, ["one", "two"])] == [3, 5]
+    fewer = found_in(study(("one", "two")), results() + results("two", lift=2.0))
+    even, before = findings.even_runs(SEEN), fewer.even_runs(SEEN)
+    assert [len(runs) for runs in even] == [3, 3]
+    np.testing.assert_allclose(even[0], before[0])
+    text, _ = written(tmp_path, results() + results("two", lift=2.0) + more)
+    assert "Of each arm as many runs of each scenario count, the first ones." in text
+    assert "| forecast | 6 |" in text.split("## All scenarios")[1]
+
+
 def test_a_run_that_takes_one_action_is_called_constant():
     episodes = tuple({**e, "action_counts": {"slower": 19, "idle": 1}} for e in result("zeros", [1.0], 0).episodes)
     made = [result("zeros", [1.0], 0, episodes=episodes), result("zeros", [1.0], 1)]
@@ -237,7 +251,7 @@ def test_headroom_alone(tmp_path: Path):
         in text
     )
     assert "minutes of a training" in text and "3 training seeds per arm" in text and "Without a result" not in text
-    text = write_headroom(tmp_path, found_in(study(), results()[:-1]), MADE, ["one, oracle, ppo, seed 2"], 4)
+    text = write_headroom(tmp_path, found_in(study(), results()[:-1]), MADE, ["one, oracle, ppo, seed 2"], "4 cells")
     for said in ("Without a result: one, oracle, ppo, seed 2.", "Not run yet: 4 cells of the study."):
         assert said in text and said in (tmp_path / "headroom.md").read_text()
     assert "## Provenance" in (tmp_path / "headroom.md").read_text()

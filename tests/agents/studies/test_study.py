@@ -18,7 +18,7 @@ import pyarrow.parquet as parquet
 import pytest
 
 import agents.study
-from agents.studies.plan import read_study
+from agents.studies.plan import Scenario, read_study
 from agents.studies.pool import run_cells
 from agents.studies.results import write_result
 from agents.study import StudyConfig, run_study
@@ -203,7 +203,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pyte
     (tmp_path / "out" / "study.toml").write_text(text)
     assert run_study(run) == 1
     out = capsys.readouterr()
-    assert f"failed: corridor, none, ppo, seed 0: error: {broken}/config.json is not a run's config" in out.err
+    assert f"failed: corridor, none, ppo, seed 0: error: {broken}/config.json is damaged (line 1" in out.err
     assert f"its log is {broken.parent}/log.txt" in out.err
     assert len(results(tmp_path)) == 4
     report = (tmp_path / "out" / "report.md").read_text()
@@ -345,6 +345,7 @@ def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
         result("zeros", [80.0], seed=0, scenario="corridor"),
         result("none", [90.0], seed=0, scenario="elsewhere"),
         result("random", [1.0, 1.0], scenario="corridor", provenance={"commit": "old", "time": "2026-01"}),
+        result("keep-lane", [-60.0], scenario="corridor"),  # no reference of the file any more
         result("none", [50.0], seed=2, scenario="corridor", env_id="merge-v1"),
     ]
     for i, each in enumerate(made):
@@ -359,8 +360,26 @@ def test_the_report_alone_takes_results_of_earlier_versions_and_runs_nothing(
         ("none", 1, 2.0),
     ]  # fmt: skip
     report = (tmp_path / "out" / "report.md").read_text()
-    assert "Not run yet: 1 cells" in report and "Commits of the results: 2 of old, 1 of new." in report
+    assert "Not run yet: 1 training of the study" in report and "Commits of the results: 2 of old, 1 of new." in report
     assert "study.before.toml" in capsys.readouterr().err
+
+
+def test_the_report_alone_says_what_to_do_with_a_damaged_result(tmp_path: Path):
+    cells = tmp_path / "out" / "cells"
+    for name in ("one", "two"):
+        (cells / name).mkdir(parents=True)
+        write_result(cells / name / "result.json", studies.result("none", [1.0], seed=0, scenario="corridor"))
+    (cells / "two" / "result.json").write_text('{"arm":')
+    (tmp_path / "out" / "study.toml").write_text("")
+    said = r"two/result.json is damaged \(line 1: no JSON \([^()]*\)\); move it away for a report of the others; the"
+    with pytest.raises(UserError, match=said):
+        run_study(replace(config(tmp_path, study_text()), report=True))
+
+
+def test_references_are_in_the_order_of_the_file():
+    found = Scenario("one", "merge-v1", {}, 1, 1, ("random", "constant-actions", "planner", "idle"))
+    measured = ["slower", "planner", "planner:constant-velocity", "idle", "faster", "keep-lane", "random"]
+    assert found.references_among(measured) == ["random", "faster", "idle", "slower", "planner"]
 
 
 def test_the_report_alone_leaves_out_results_of_other_settings(
@@ -389,7 +408,7 @@ def test_the_report_alone_leaves_out_results_of_other_settings(
     episodes = parquet.read_table(tmp_path / "out" / "episodes.parquet").to_pylist()
     assert [(e["arm"], e["seed"], e["return"]) for e in episodes] == [("random", None, 1.0), ("none", 0, 2.0)]
     assert "left out: 2 results of other settings than corridor's file has now" in capsys.readouterr().err
-    assert "Not run yet: 1 cells" in (tmp_path / "out" / "report.md").read_text()
+    assert "Not run yet: 1 training of" in (tmp_path / "out" / "report.md").read_text()
 
 
 @pytest.mark.parametrize("other", [{"scenarios": ("corridor",)}, {"seeds": 1}, {"cluster": "auto"}])

@@ -243,7 +243,10 @@ def test_file_that_is_no_policy_is_named(kind: str, tmp_path: Path, policies: Pa
     else:
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("notes.txt", "a zip, but no policy")
-    with pytest.raises(UserError, match=f"{kind}.zip holds no policy of ppo, dqn, a2c, sac, qrdqn, recurrent-ppo, tqc"):
+    said = (
+        "holds no policy of ppo, dqn, a2c, sac, qrdqn, recurrent-ppo, tqc" if kind == "foreign" else "is damaged; copy"
+    )
+    with pytest.raises(UserError, match=f"{kind}.zip {said}"):
         make_ego_driver(str(path), discrete, np.random.default_rng(0))
 
 

@@ -25,6 +25,7 @@ from envs.sb3.policy_file import (
     pin_forecaster,
     read_note,
     read_policy_note,
+    selection_return,
     write_note,
 )
 from envs.wrappers import ForecastObservation
@@ -191,6 +192,22 @@ def test_a_policy_of_contrib_needs_its_package(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(UserError, match=r"algorithm qrdqn needs the sb3-contrib package; pip install 'dgvae-rl\[con"):
         load_policy(path)
     assert load_policy(saved(tmp_path, "dqn")) is not None
+
+
+def test_a_zip_that_is_cut_anywhere_is_damaged(tmp_path: Path):
+    """Its weights are a zip of their own: cut soon after them, the file still holds a whole archive, another one."""
+    path, cut = saved(tmp_path, "ppo"), tmp_path / "cut.zip"
+    write_note(path, None, {"selection_return": 3.0}, "ppo")
+    assert algorithm_of(path) == "ppo" and selection_return(path) == 3.0
+    content, inner = path.read_bytes(), 0
+    for size in range(0, len(content), max(1, len(content) // 150)):
+        cut.write_bytes(content[:size])
+        inner += zipfile.is_zipfile(cut)
+        with pytest.raises(UserError, match="cut.zip is damaged; copy it again, or name another .zip of its run$"):
+            algorithm_of(cut)
+        with pytest.raises(UserError, match="cut.zip is damaged; remove it to go on without it$"):
+            selection_return(cut)
+    assert inner
 
 
 def test_a_zip_that_lacks_its_weights_is_one_clear_line(tmp_path: Path):
