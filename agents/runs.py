@@ -149,7 +149,7 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
             if place and point["steps"] <= points[place - 1]["steps"]:
                 raise UserError(f"{path}: {place}: steps must rise, got {point['steps']}")
     except UserError as error:
-        raise UserError(f"{advice} ({error})") from error
+        raise UserError(f"{advice} ({damage_in(path, error)})") from error
     return list(points)
 
 

@@ -36,7 +36,7 @@ from predictor.support.files import check_out, delete_leftovers, disk_errors_of,
 from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
-from predictor.support.reading import MIB, as_object, check_regular, read_bytes, read_object
+from predictor.support.reading import MIB, as_object, check_regular, damage_in, read_bytes, read_object
 from predictor.support.runtime import keep_freed_memory
 from predictor.support.stopping import resumable
 from predictor.support.typed_values import converted
@@ -304,7 +304,8 @@ def _check_folder(folder: Path, config: TuneConfig) -> None:
         before = as_object(content["config"], f"{file}: config")
         converted(content.get("provenance", []), tuple[dict[str, Any], ...], f"{file}: provenance")
     except (UserError, KeyError) as error:
-        raise UserError(f"{file} is damaged ({error}); remove {folder} or choose another --out") from error
+        why = damage_in(file, error)
+        raise UserError(f"{file} is damaged ({why}); remove {folder} or choose another --out") from error
     defaults = {field.name: field.default for field in fields(TuneConfig)}  # of fields that are newer than the tuning
     for name, now in _settings_of_tuning(config).items():
         then = before.get(name, defaults.get(name))

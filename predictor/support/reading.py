@@ -145,7 +145,7 @@ def read_object(path: Path, most_bytes: int = MOST_JSON_BYTES) -> dict[str, Any]
     return as_object(read_json(path, most_bytes), short(path))
 
 
-def damage_in(path: Path, error: UserError) -> str:
+def damage_in(path: Path, error: Exception) -> str:
     """Returns what an error says of the content of a file, without the file's name and without advice."""
     return str(error).removeprefix(short(path)).lstrip(":, ").removesuffix("; get it anew")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from predictor.support.errors import UserError
 from predictor.support.files import finite, write_json
-from predictor.support.reading import read_json
+from predictor.support.reading import damage_in, read_json
 from predictor.support.typed_values import converted
 
 CURVE_FILE = "curve.json"
@@ -33,7 +33,7 @@ def read_curve(path: Path) -> list[Point]:
                 raise UserError(f"{path}: point {number + 1}: key '{missing[0]}' is missing")
             points.append({key: float("nan") if value is None else value for key, value in entry.items()})
     except UserError as error:
-        raise UserError(f"{path} is damaged; remove it to go on without it ({error})") from error
+        raise UserError(f"{path} is damaged; remove it to go on without it ({damage_in(path, error)})") from error
     return points
 
 
