@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED, Evaluation, read_evaluation
-from agents.runs import CONFIG_FILE, CURVE_FILE, SUMMARY_FILE, read_config, read_curve
+from agents.runs import CONFIG_FILE, CURVE_FILE, OPTIONS_OF, SUMMARY_FILE, read_config, read_curve
 from agents.summaries import EXTREMES
 from envs.simulators.envpool import ENV_IDS
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
@@ -51,7 +51,8 @@ def policy_blocks(run: Path, accuracies: Sequence[Path]) -> list[Block]:
         blocks += [Heading("Learning curve"), Picture("curves.svg", svg, told, png)]
     if evaluation is not None:
         blocks += [Heading("Evaluation"), *_tables(evaluation), *_worst(evaluation)]
-    blocks += [*_loop_errors(points), *accuracy(accuracies), *settings(config)]
+    named = {OPTIONS_OF.get(name, name): value for name, value in config.items()}
+    blocks += [*_loop_errors(points), *accuracy(accuracies), *settings(named)]
     starts = read_object(run / CONFIG_FILE).get("provenance", [])
     return [*blocks, *origin(starts, str(run / CONFIG_FILE))]
 

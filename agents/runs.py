@@ -42,6 +42,8 @@ SHIPPED = Path(__file__).resolve().parent / "pretrained"
 LARGEST = 1e30
 """Largest size of a number in a learning curve; larger ones cannot be drawn."""
 
+OPTIONS_OF = {"envs": "num_envs", "partner": "driver"}
+"""Options of train_policy.py by the older names that the config keeps for them."""
 _BUFFER_ENTRY = "replay_buffer.pkl"
 _WITHOUT_CONFIG = "move it away to use the run's policy.zip alone, or train anew in another folder"
 
@@ -282,7 +284,7 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
         if isinstance(was, dict) and isinstance(now, dict):  # name the part that differs
             part = next(key for key in was if key not in now or was[key] != now[key])
             name, was, now = f"{name}.{part}", was[part], now.get(part, "not there")
-        name = {"envs": "num_envs", "partner": "driver"}.get(name, name)  # the config keeps the older names
+        name = OPTIONS_OF.get(name, name)
         raise UserError(
             f"cannot resume {file.parent}: {name} was {was!r}, now {now!r}; pass the old value or choose another --out"
         )

@@ -135,6 +135,15 @@ def test_names_of_strangers_are_text(tmp_path: Path):
     assert "<script" not in page and "&lt;script&gt;" in page and "<b>" not in page
 
 
+def test_settings_have_the_names_of_the_options(tmp_path: Path):
+    """The config keeps older ones of two of them."""
+    page = page_of(a_run(tmp_path, envs=6, partner="heuristic"))
+    assert re.search(r"<td>num_envs</td>\s*<td>6</td>", page) and re.search(
+        r"<td>driver</td>\s*<td>heuristic</td>", page
+    )
+    assert "partner" not in page
+
+
 def test_a_name_with_dollars_is_no_formula(tmp_path: Path):
     """Matplotlib's formulas are a language of their own, which raises at what it does not know."""
     figure, axes = drawn([{"steps": 1, "return": 2.0}], {r"runs/$\old$": 1.0})
