@@ -112,7 +112,7 @@ def test_plans_are_looked_for_with_the_driver_that_was_asked_for(
     def refuse(env_id: str, driver: str, env_kwargs: str) -> None:
         raise UserError(f"opened with {driver}")
 
-    monkeypatch.setattr(plan_run, "open_world", refuse)
+    monkeypatch.setattr("envs.rollouts.world.open_world", refuse)
     with pytest.raises(UserError, match=f"opened with {opened}"):
         measure_plans(replace(run(), driver=driver))
     config = EvaluateConfig(("highway-fast-v0",), checkpoint=("constant-velocity",), driver=driver, plans=True)
