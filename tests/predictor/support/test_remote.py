@@ -315,7 +315,7 @@ def test_training_reads_stores_and_starts_from_checkpoints_there(
     options: dict[str, Any] = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 3, "val_windows": 4}
     for place in (there, tmp_path):
         write_store(place / "train", INFO, episodes(4))
-        write_store(place / "val", INFO, episodes(2))
+        write_store(place / "val", INFO, episodes(6)[4:])
     weights = []
     for place, name in ((there, "run-far"), (tmp_path, "run-near")):
         config = TrainConfig(
