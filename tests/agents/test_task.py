@@ -225,6 +225,24 @@ def test_perception_must_be_positive_and_have_an_effect():
 RUN = {"env_id": "merge-v1", "observe": "forecast", "checkpoint": None}
 
 
+def test_a_config_that_does_not_fit_is_named_with_its_file():
+    """Its values were no options of the command that reads it."""
+    run = RUN | {"observe": "none", "perception_m": 20.0}
+    with pytest.raises(UserError, match="^runs/old/config.json: perception_m has no effect with observe=none"):
+        task_of(run, where="runs/old/config.json")
+
+
+@pytest.mark.parametrize("learners", [("nobody",), ("agent_0", "adversary_0", "adversary_1", "adversary_2")])
+def test_what_does_not_fit_leaves_no_environment_open(learners: tuple[str, ...], monkeypatch: pytest.MonkeyPatch):
+    task, closed = Task(TAG, "none", learners=learners, driver="random"), []
+    env = task.make()
+    monkeypatch.setattr(env, "close", lambda: closed.append(True))
+    monkeypatch.setattr(Task, "make", lambda *_, **__: env)
+    with pytest.raises(UserError, match="nobody|leave driver out"):
+        task.check()
+    assert closed
+
+
 @pytest.fixture
 def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A module that can be imported and says so."""

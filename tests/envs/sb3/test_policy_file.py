@@ -194,6 +194,14 @@ def test_a_policy_of_contrib_needs_its_package(tmp_path: Path, monkeypatch: pyte
     assert load_policy(saved(tmp_path, "dqn")) is not None
 
 
+def test_another_number_of_plans_is_said_by_what_changes_it():
+    """No option has the name num_plans."""
+    with pytest.raises(
+        UserError, match="policy x was trained with 5 candidate plans .* here there are 9; give the env"
+    ):
+        replace(PIN, num_plans=5).check(replace(PIN, num_plans=9), "policy x")
+
+
 def test_a_zip_that_is_cut_anywhere_is_damaged(tmp_path: Path):
     """Its weights are a zip of their own: cut soon after them, the file still holds a whole archive, another one."""
     path, cut = saved(tmp_path, "ppo"), tmp_path / "cut.zip"

@@ -320,6 +320,9 @@ def test_stores_that_differ_in_frame_or_range_are_named(circles: Path, tmp_path:
     (note,) = Trainer(both, load_data(both)).notes
     assert note.startswith("perception_m is 7.5 in ") and f"near and {spec().perception_m} in " in note
     assert note.endswith("circles; the checkpoint keeps that of the first") and load_data(both).spec == near
+    scaled = replace(spec(), feature_scales=tuple(2 * scale for scale in spec().feature_scales))
+    write_store(tmp_path / "scaled", StoreInfo(scaled, "scaled"), [circling_episode(i) for i in range(6)])
+    assert load_data(replace(both, data=(circles, tmp_path / "scaled"))).notes[0].startswith("feature_scales is ")
     alike = replace(both, data=(circles, circles))
     assert load_data(alike).notes == ()
 
