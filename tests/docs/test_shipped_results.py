@@ -5,6 +5,7 @@ import tarfile
 import tomllib
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ ARCHIVES = sorted((ROOT / "docs" / "studies").glob("*.tar.xz"))
 def results_of(archive: Path, folder: Path) -> list[Result]:
     """Returns the results in an archive, each with its hash checked."""
     with tarfile.open(archive) as packed:
-        packed.extractall(folder, filter="data")
+        safe: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.4 and later
+        packed.extractall(folder, **safe)
     return [read_result(path) for path in sorted(folder.glob("cells/*/result.json"))]
 
 
