@@ -18,11 +18,9 @@ from envs.rollouts.causal_labels import CausalSettings, direct_shift_m, farthest
 from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.world import World
 from envs.seeding import Purpose, episode_rng
-from envs.simulators.interventions import Intervention, Kind
-from envs.supervision import EnvironmentFailedError
+from envs.simulators.interventions import Intervention, Kind, NotAllowedError
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.scene import Scene
-from predictor.support.errors import UserError
 
 SHARES: dict[Kind, float] = {"brake": 0.55, "accelerate": 0.2, "remove": 0.25}
 """Probability of each kind; a kind that an agent does not allow is drawn anew."""
@@ -174,9 +172,7 @@ def _perturbed(
             if kind == "brake" and speed_mps < AT_REST * mix.brake_mps[0]:
                 continue  # nothing would change
             return point.perturbed(drawn)
-        except EnvironmentFailedError:
-            raise
-        except UserError:
+        except NotAllowedError:
             continue  # an ego that cannot be taken out
     return None
 

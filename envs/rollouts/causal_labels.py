@@ -25,11 +25,9 @@ from jaxtyping import Float
 from envs.rollouts.branches import Branches, BranchPoint, copied
 from envs.rollouts.interventions import intervene, interventions_of, is_on_roads, kinds_of
 from envs.rollouts.world import World
-from envs.simulators.interventions import Intervention, Kind
+from envs.simulators.interventions import Intervention, Kind, NotAllowedError
 from envs.simulators.stand_in import seat_driver
-from envs.supervision import EnvironmentFailedError
 from predictor.data.store import Episode
-from predictor.support.errors import UserError
 
 TRIED: tuple[Kind, ...] = ("brake", "remove")
 """What is done to a sender; a vehicle at rest can hold others up without braking, and a policy's cannot be removed."""
@@ -186,9 +184,7 @@ def possible(world: World, agent: int, steps: int) -> list[Intervention]:
         intervention, beside = Intervention(agent, kind, steps), copied(world)
         try:
             intervene(beside, intervention)
-        except EnvironmentFailedError:
-            raise
-        except UserError:
+        except NotAllowedError:
             continue
         found.append(intervention)
     return found

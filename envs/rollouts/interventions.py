@@ -17,7 +17,7 @@ from typing import Any
 
 from envs.rollouts.world import World
 from envs.simulators.held_agents import MotionLog
-from envs.simulators.interventions import Intervention, Kind, hold, in_force, kinds_for, start
+from envs.simulators.interventions import Intervention, Kind, NotAllowedError, hold, in_force, kinds_for, start
 from predictor.support.errors import UserError
 
 
@@ -25,13 +25,14 @@ def intervene(world: World, intervention: Intervention) -> None:
     """Begins an intervention; it acts from the next step on, and a change of speed at once acts now.
 
     Raises:
-        UserError: the environment or the agent does not allow it, or no such agent is present.
+        NotAllowedError: the agent does not allow it, or no such agent is present.
+        UserError: the environment cannot be perturbed.
     """
     kinds_of(world)
     body = body_of(world, intervention.agent)
     if body is None:
         present = ", ".join(str(agent) for agent in sorted(world.full_scene().ids.tolist()))
-        raise UserError(f"no agent {intervention.agent} is present; present are {present}")
+        raise NotAllowedError(f"no agent {intervention.agent} is present; present are {present}")
     start(world.env, body, intervention)
 
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from envs.rollouts.interventions import intervene, interventions_of, is_on_roads, kinds_of
 from envs.rollouts.world import World
-from envs.simulators.interventions import Intervention, Kind
-from envs.supervision import EnvironmentFailedError
+from envs.simulators.interventions import Intervention, Kind, NotAllowedError
 from predictor.support.errors import UserError
 
 Range = tuple[float, float]
@@ -93,9 +92,7 @@ class Perturber:
                     continue
                 try:
                     intervene(self._world, self._draw(int(agent), kind))
-                except EnvironmentFailedError:
-                    raise
-                except UserError:
+                except NotAllowedError:
                     continue  # a landmark, the outermost lane, the ego taken out
                 self._latest = (int(agent), kind)
                 return

@@ -26,12 +26,10 @@ from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pair
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
 from envs.seeding import Purpose, episode_rng
-from envs.simulators.interventions import Intervention
-from envs.supervision import EnvironmentFailedError
+from envs.simulators.interventions import Intervention, NotAllowedError
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
 from predictor.scene import Scene, SceneSpec
-from predictor.support.errors import UserError
 
 STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
 """Names of the forecasters that no checkpoint holds."""
@@ -164,9 +162,7 @@ class Moment:
         if intervention not in self._tried:
             try:
                 self._tried[intervention] = self._point.perturbed(intervention)
-            except EnvironmentFailedError:
-                raise
-            except UserError:  # one that does not act by itself
+            except NotAllowedError:  # one that does not act by itself
                 self._tried[intervention] = None
         return self._tried[intervention]
 

@@ -15,8 +15,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from envs.simulators.held_agents import HeldAgents, MotionLog
-from envs.simulators.intervention import Intervention
-from predictor.support.errors import UserError
+from envs.simulators.intervention import Intervention, NotAllowedError
 
 MOTION = ("position", "heading", "speed", "lane", "lane_index", "target_lane_index", "route", "action", "crashed")
 """Attributes of a vehicle that make up its motion in a frame; others foresee it along its route."""
@@ -37,17 +36,19 @@ def intervene_on_road(env: AbstractEnv, vehicle: Vehicle, intervention: Interven
     """Begins an intervention on a vehicle of a running environment.
 
     Raises:
-        UserError: the vehicle is under an intervention already, has no such lane, is steered by a policy itself, or
-            would be taken out although a policy drives it.
+        NotAllowedError: the vehicle is under an intervention already, has no such lane, is steered by a policy
+            itself, or would be taken out although a policy drives it.
     """
     name = f"agent {intervention.agent}"
     if (standing := env.road.__dict__.get("act")) is not None:
         standing.end_finished()
     if intervention.agent in road_interventions(env):
-        raise UserError(f"{name} is under an intervention already; let it end, or choose another agent")
+        raise NotAllowedError(f"{name} is under an intervention already; let it end, or choose another agent")
     if intervention.kind == "remove":
         if vehicle in env.controlled_vehicles:
-            raise UserError(f"{name} is driven by a policy and cannot be taken out; brake it, or choose another agent")
+            raise NotAllowedError(
+                f"{name} is driven by a policy and cannot be taken out; brake it, or choose another agent"
+            )
         begun: _Override = _Absence(vehicle, intervention, env)
     elif intervention.kind in ("left", "right"):
         begun = _LaneChange(vehicle, intervention, env)
@@ -220,13 +221,15 @@ class _LaneChange(_Override):
         super().__init__(vehicle, intervention, env)
         name, side = f"agent {intervention.agent}", intervention.kind
         if not isinstance(vehicle, ControlledVehicle):
-            raise UserError(f"{name} is steered by its policy itself and cannot be sent to another lane; brake it")
+            raise NotAllowedError(
+                f"{name} is steered by its policy itself and cannot be sent to another lane; brake it"
+            )
         start, end, lane = vehicle.target_lane_index
         aside = (start, end, -1 if lane is None else lane + (1 if side == "right" else -1))
         lanes = vehicle.road.network.graph[start][end]
         inside = 0 <= aside[2] < len(lanes)
         if not inside or not vehicle.road.network.get_lane(aside).is_reachable_from(vehicle.position):
-            raise UserError(f"{name} has no lane on its {side}; choose the other side, or another agent")
+            raise NotAllowedError(f"{name} has no lane on its {side}; choose the other side, or another agent")
         self._aside = aside
 
     def begin(self) -> None:

@@ -11,6 +11,10 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 """Kinds of interventions."""
 
 
+class NotAllowedError(UserError):
+    """Raised when an agent does not allow an intervention: try another kind, or another agent."""
+
+
 @dataclass(frozen=True)
 class Intervention:
     """What is done to one agent."""

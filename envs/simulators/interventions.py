@@ -13,7 +13,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 
 from envs.simulators.held_agents import MotionLog
 from envs.simulators.highway_interventions import hold_on_road, intervene_on_road, log_road, road_interventions
-from envs.simulators.intervention import KINDS, Intervention, Kind
+from envs.simulators.intervention import KINDS, Intervention, Kind, NotAllowedError
 from envs.simulators.mpe_interventions import (
     drop_from_particles,
     hold_particles,
@@ -27,6 +27,7 @@ __all__ = [
     "KINDS",
     "Intervention",
     "Kind",
+    "NotAllowedError",
     "drop_all",
     "generator_of",
     "hold",
@@ -64,7 +65,8 @@ def start(env: Any, body: Any, intervention: Intervention) -> None:
     """Begins an intervention on one agent, the simulator's own object.
 
     Raises:
-        UserError: the simulator, or this agent, does not allow it.
+        NotAllowedError: this agent does not allow it.
+        UserError: no agent of this simulator does.
     """
     kinds_for(env)
     simulator = simulator_of(env)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.simulators.held_agents import HeldAgents, MotionLog
-from envs.simulators.intervention import Intervention
+from envs.simulators.intervention import Intervention, NotAllowedError
 from predictor.support.errors import UserError
 
 MOTION = ("p_pos", "p_vel", "u")
@@ -31,15 +31,20 @@ def intervene_on_particles(world: Any, body: Any, intervention: Intervention) ->
     """Begins an intervention on an agent of a running world.
 
     Raises:
-        UserError: not an agent that moves, under an intervention already, or a lane change, since there are no lanes.
+        NotAllowedError: not an agent that moves, under an intervention already, or a lane change, since there are no
+            lanes.
     """
     name = f"agent {intervention.agent}"
     if intervention.agent in particle_interventions(world):
-        raise UserError(f"{name} is under an intervention already; let it end, or choose another agent")
+        raise NotAllowedError(f"{name} is under an intervention already; let it end, or choose another agent")
     if intervention.kind in ("left", "right"):
-        raise UserError("mpe2's arenas have no lanes, so left and right are not possible; use brake or accelerate")
+        raise NotAllowedError(
+            "mpe2's arenas have no lanes, so left and right are not possible; use brake or accelerate"
+        )
     if not any(agent is body for agent in world.agents) or not body.movable or body.action_callback is not None:
-        raise UserError(f"{name} ({body.name}) does not move by actions and cannot be perturbed; choose another agent")
+        raise NotAllowedError(
+            f"{name} ({body.name}) does not move by actions and cannot be perturbed; choose another agent"
+        )
     begun = (_Absence if intervention.kind == "remove" else _Push)(world, body, intervention)
     if intervention.steps:
         _standing(world).running.append(begun)

@@ -22,7 +22,7 @@ from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, senders_of
 from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import open_world
-from envs.simulators.interventions import Intervention
+from envs.simulators.interventions import Intervention, NotAllowedError
 from envs.supervision import EnvironmentFailedError
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.data.windows import Windows
@@ -196,7 +196,7 @@ def test_who_stands_does_not_brake(monkeypatch: pytest.MonkeyPatch):
 
         def refuses(point: BranchPoint, intervention: Intervention) -> Branches:
             kinds.add(intervention.kind)
-            raise UserError("not this one")
+            raise NotAllowedError("not this one")
 
         monkeypatch.setattr(BranchPoint, "perturbed", refuses)
         for seed in range(9):

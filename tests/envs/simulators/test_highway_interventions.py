@@ -9,8 +9,7 @@ import pytest
 from envs.rollouts.interventions import body_of, intervene, interventions_of
 from envs.rollouts.world import EgoWorld, World, open_world
 from envs.simulators.highway_interventions import RATE_MPS2
-from envs.simulators.intervention import Intervention, Kind
-from predictor.support.errors import UserError
+from envs.simulators.intervention import Intervention, Kind, NotAllowedError
 from tests.envs.interventions import assert_same_scenes, played, road_world, state_of
 
 CARS = ((0.0, 4.0), (40.0, 4.0), (80.0, 4.0), (40.0, 8.0))
@@ -160,7 +159,9 @@ def test_an_ego_that_steers_itself_keeps_its_own_acceleration_for_later():
     target = float(np.linalg.norm(before[2:])) - 1.5
     assert speeds[-1] == pytest.approx(target, abs=1e-6)
     assert min(speeds) >= target - 1e-6
-    with pytest.raises(UserError, match="agent 0 is steered by its policy itself and cannot be sent to another lane"):
+    with pytest.raises(
+        NotAllowedError, match="agent 0 is steered by its policy itself and cannot be sent to another lane"
+    ):
         intervene(road_without(world), Intervention(0, "left", 2))
 
 
@@ -207,7 +208,7 @@ def test_learners_of_the_multiagent_intersection_can_be_perturbed():
     intervene(world, Intervention(agent, "brake", 2, change_mps=3.0))
     world.step()
     assert learner.speed <= np.linalg.norm(state_of(before, agent)[2:]) - 3.0 + 1e-6
-    with pytest.raises(UserError, match=f"agent {agent} is under an intervention already"):
+    with pytest.raises(NotAllowedError, match=f"agent {agent} is under an intervention already"):
         intervene(world, Intervention(agent, "brake", 2))
 
 
@@ -221,7 +222,7 @@ def test_learners_of_the_multiagent_intersection_can_be_perturbed():
 )
 def test_what_is_not_possible_is_named(intervention: Intervention, message: str):
     world = road_world(*CARS, (0.0, 0.0))
-    with pytest.raises(UserError, match=f"^{message}"):
+    with pytest.raises(NotAllowedError, match=f"^{message}"):
         intervene(world, intervention)
     assert interventions_of(world) == {}
 

@@ -5,9 +5,8 @@ import pytest
 
 from envs.rollouts.interventions import intervene, interventions_of, kinds_of
 from envs.rollouts.world import World, open_world
-from envs.simulators.intervention import Intervention, Kind
+from envs.simulators.intervention import Intervention, Kind, NotAllowedError
 from envs.simulators.mpe_interventions import AWAY_M
-from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played, state_of
 
 TAG = "simple_tag_v3"
@@ -114,7 +113,7 @@ def test_a_reset_drops_interventions():
     ],
 )
 def test_what_is_not_possible_is_named(agent: int, kind: Kind, message: str):
-    with pytest.raises(UserError, match=f"^{message}"):
+    with pytest.raises(NotAllowedError, match=f"^{message}"):
         intervene(chase(1), Intervention(agent, kind, 2))
 
 
