@@ -6,34 +6,18 @@ anew within each scenario, never across them.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from predictor.evaluation.standard_errors import Estimate
 from predictor.support.errors import UserError
 
 Runs = Sequence[Float[np.ndarray, " _"]]
 """Scores of the runs of each scenario; their numbers may differ."""
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
-
-
-class Estimate(NamedTuple):
-    """Estimate with its 95 % interval."""
-
-    value: float
-    """Estimate from all runs."""
-    low: float
-    """Lower end of the interval; NaN if there is none."""
-    high: float
-    """Upper end of the interval; NaN if there is none."""
-
-    @property
-    def has_interval(self) -> bool:
-        """Whether there is an interval."""
-        return not np.isnan(self.low)
 
 
 def interquartile_mean(runs: Runs) -> float:
@@ -50,22 +34,22 @@ def mean_with_t_interval(scores: Float[np.ndarray, " runs"]) -> Estimate:
     """Computes the mean with Student's interval; a single run has none."""
     centre = float(np.mean(scores))
     if len(scores) < 2:
-        return Estimate(centre, np.nan, np.nan)
+        return Estimate(centre, None)
     half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(scores) - 1) * np.std(scores, ddof=1) / np.sqrt(len(scores))
-    return Estimate(centre, float(centre - half), float(centre + half))
+    return Estimate(centre, (float(centre - half), float(centre + half)))
 
 
 def gain_with_t_interval(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> Estimate:
     """Computes the difference of two means with Welch's interval; without one if a sample has a single run."""
     difference = float(np.mean(ours) - np.mean(theirs))
     if min(len(ours), len(theirs)) < 2:
-        return Estimate(difference, np.nan, np.nan)
+        return Estimate(difference, None)
     variances = np.array([np.var(each, ddof=1) / len(each) for each in (ours, theirs)])
     if not variances.any():
-        return Estimate(difference, difference, difference)
+        return Estimate(difference, (difference, difference))
     freedom = variances.sum() ** 2 / (variances**2 / [len(ours) - 1, len(theirs) - 1]).sum()
     half = stats.t.ppf(0.5 + CONFIDENCE / 2, freedom) * np.sqrt(variances.sum())
-    return Estimate(difference, float(difference - half), float(difference + half))
+    return Estimate(difference, (float(difference - half), float(difference + half)))
 
 
 def bootstrapped(
@@ -85,10 +69,10 @@ def bootstrapped(
     """
     value = float(statistic(*samples))
     if any(len(scores) < 2 for runs in samples for scores in runs):
-        return Estimate(value, np.nan, np.nan)
+        return Estimate(value, None)
     drawn = [statistic(*([_redrawn(s, generator) for s in runs] for runs in samples)) for _ in range(resamples)]
     low, high = np.nanpercentile(drawn, [50 - 50 * CONFIDENCE, 50 + 50 * CONFIDENCE])
-    return Estimate(value, float(low), float(high))
+    return Estimate(value, (float(low), float(high)))
 
 
 def probability_of_improvement(ours: Runs, theirs: Runs) -> float:

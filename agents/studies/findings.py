@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from agents.studies.estimators import (
     RESAMPLES,
-    Estimate,
     Runs,
     bootstrapped,
     gain,
@@ -26,6 +25,7 @@ from agents.studies.plan import Study, is_constant
 from agents.studies.results import Result
 from agents.summaries import NEARLY_CONSTANT, reports_only_events, wilson_interval
 from envs.drivers.planner import ORACLE, PLANNER, is_planner, planner_checkpoint
+from predictor.evaluation.standard_errors import Estimate
 
 
 class Line(NamedTuple):
@@ -112,7 +112,7 @@ class Findings:
             return None
         reported = [np.array([bool(each) for each in run], dtype=np.float64) for run in crashed]
         if line.algorithm is None:
-            return Estimate(mean(reported), *wilson_interval(int(reported[0].sum()), len(reported[0])))
+            return Estimate(mean(reported), wilson_interval(int(reported[0].sum()), len(reported[0])))
         rates = np.array([np.mean(found) for found in reported])
         return self.estimate(mean, [rates], about=("crashes", scenario, *line))
 
@@ -199,7 +199,7 @@ class Findings:
         """
         assert line.algorithm is not None
         headroom = self.headroom(scenario, line.algorithm)
-        if headroom is None or not headroom.low > 0:
+        if headroom is None or headroom.interval is None or headroom.interval[0] <= 0:
             return None
         ends = [Line(name, line.algorithm) for name in (self.study.floor, self.study.ceiling)]
         samples = [[self.runs(scenario, x)] for x in (line, *ends)]

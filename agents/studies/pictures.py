@@ -12,8 +12,9 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from scipy import stats
 
-from agents.studies.estimators import CONFIDENCE, Estimate, performance_profile, profile_band
+from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
+from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.figures import panels, svg_of
 from predictor.reports.looks import AS_TEXT, BLACK, BLUE, BROWN, COLORS, DASHES, GREY, ORANGE
 
@@ -61,7 +62,10 @@ def plot_curve(
 
 def plot_score(ax: Axes, place: float, score: Estimate, **style: Any) -> Axes:
     """Draws a mean return on the test seeds, with its interval if it has one, at a place to the right of the curves."""
-    spread = [[score.value - score.low], [score.high - score.value]] if score.has_interval else None
+    spread = None
+    if score.interval is not None:
+        low, high = score.interval
+        spread = [[score.value - low], [high - score.value]]
     ax.errorbar([place], [score.value], spread, marker="D", ms=4.5, lw=1.2, color=style.get("color"))
     return ax
 

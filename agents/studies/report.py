@@ -9,10 +9,11 @@ import numpy as np
 
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED
-from agents.studies.estimators import Estimate, interquartile_mean
+from agents.studies.estimators import interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
 from envs.drivers.planner import ORACLE, PLANNER
+from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from predictor.support.files import write_text
 
@@ -79,8 +80,9 @@ def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str 
     if np.isnan(estimate.value):
         return NOTHING
     value = f"{scale * estimate.value:.{digits}f}{unit}"
-    if estimate.has_interval:
-        value += f" ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
+    if estimate.interval is not None:
+        low, high = estimate.interval
+        value += f" ({scale * low:.{digits}f} to {scale * high:.{digits}f})"
     return value.replace("-", "−")
 
 

@@ -40,9 +40,9 @@ class Estimate:
     """A number with its interval."""
 
     value: float
-    """Value over all episodes."""
+    """Value over all that was measured."""
     interval: tuple[float, float] | None
-    """95 % bootstrap over episodes; None with fewer than two, or where all rests on one."""
+    """95 %, by default a bootstrap over episodes; None with fewer than two, or where all rests on one."""
 
 
 def ratio_statistics(

@@ -17,6 +17,7 @@ from agents.studies.estimators import (
     profile_band,
     share_of_headroom,
 )
+from predictor.evaluation.standard_errors import Estimate
 from predictor.support.errors import UserError
 
 RNG = np.random.default_rng(3)
@@ -48,21 +49,22 @@ def test_the_interval_of_a_mean_is_that_of_students_test():
     scores = np.array([1.0, 2.0, 4.0])
     found = mean_with_t_interval(scores)
     assert found.value == pytest.approx(7 / 3)
-    assert (found.low, found.high) == pytest.approx(stats.ttest_1samp(scores, 0).confidence_interval(0.95))
-    assert not mean_with_t_interval(np.array([5.0])).has_interval
+    assert found.interval == pytest.approx(stats.ttest_1samp(scores, 0).confidence_interval(0.95))
+    assert mean_with_t_interval(np.array([5.0])).interval is None
 
 
 def test_the_interval_of_a_difference_is_that_of_welchs_test():
     ours, theirs = np.array([1.0, 2.0, 4.0, 4.5]), np.array([0.0, 0.1, 0.4])
     found = gain_with_t_interval(ours, theirs)
     expected = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
-    assert found == pytest.approx((ours.mean() - theirs.mean(), *expected))
+    assert (found.value, found.interval) == (pytest.approx(ours.mean() - theirs.mean()), pytest.approx(expected))
     same = gain_with_t_interval(np.full(3, 5.27), theirs)
-    assert same.high - same.value == pytest.approx(stats.t.ppf(0.975, 2) * stats.sem(theirs)), "one of them is constant"
-    assert gain_with_t_interval(np.array([2.0, 2.0]), np.array([1.5, 1.5, 1.5])) == (0.5, 0.5, 0.5)
+    half = stats.t.ppf(0.975, 2) * stats.sem(theirs)
+    assert same.interval == pytest.approx((same.value - half, same.value + half)), "one of them is constant"
+    assert gain_with_t_interval(np.array([2.0, 2.0]), np.array([1.5, 1.5, 1.5])) == Estimate(0.5, (0.5, 0.5))
     for few in ((ours, theirs[:1]), (ours[:1], theirs)):
         assert gain_with_t_interval(*few).value == few[0].mean() - few[1].mean()
-        assert not gain_with_t_interval(*few).has_interval
+        assert gain_with_t_interval(*few).interval is None
 
 
 def test_improvement_in_closed_form():
@@ -87,7 +89,7 @@ def test_improvement_is_that_of_a_plain_loop_and_of_scipy():
 def test_the_bootstrap_stays_within_scenarios():
     """Scores differ between scenarios alone: whatever is drawn within one, the mean is the same."""
     found = bootstrapped(mean, runs([1, 1, 1], [5, 5]), generator=np.random.default_rng(0))
-    assert found == (3.0, 3.0, 3.0)
+    assert found == Estimate(3.0, (3.0, 3.0))
 
 
 def test_the_bootstrap_is_that_of_a_plain_loop():
@@ -100,24 +102,24 @@ def test_the_bootstrap_is_that_of_a_plain_loop():
             means.append(np.mean([np.mean(scores) for scores in drawn]))
         values.append(means[0] - means[1])
     assert found.value == pytest.approx(mean(TWO) - mean(OTHER))
-    assert (found.low, found.high) == pytest.approx(np.percentile(values, [2.5, 97.5]))
+    assert found.interval == pytest.approx(np.percentile(values, [2.5, 97.5]))
 
 
 def test_the_bootstrap_of_many_runs_is_the_normal_interval():
     scores = np.random.default_rng(1).normal(size=400)
     found = bootstrapped(mean, [scores], generator=np.random.default_rng(2))
     half = 1.96 * scores.std() / 20
-    assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half), abs=0.01)
+    assert found.interval == pytest.approx((found.value - half, found.value + half), abs=0.01)
 
 
 def test_a_single_run_has_no_interval():
-    assert not bootstrapped(mean, runs([1], [2]), generator=np.random.default_rng(0)).has_interval
+    assert bootstrapped(mean, runs([1], [2]), generator=np.random.default_rng(0)).interval is None
 
 
 @pytest.mark.parametrize("samples", [(runs([1, 2, 3]), runs([2])), (runs([1, 2], [3]), runs([1, 2], [3, 4]))])
 def test_beside_a_single_run_nothing_has_an_interval(samples: tuple[Any, Any]):
     """How much runs differ is not known of it."""
-    assert not bootstrapped(gain, *samples, generator=np.random.default_rng(0)).has_interval
+    assert bootstrapped(gain, *samples, generator=np.random.default_rng(0)).interval is None
 
 
 def test_the_share_of_headroom():

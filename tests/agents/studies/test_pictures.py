@@ -4,9 +4,9 @@ import itertools
 
 from matplotlib import pyplot as plt
 
-from agents.studies.estimators import Estimate
 from agents.studies.findings import Line
 from agents.studies.pictures import plot_score, styles_of
+from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import BLACK, BLUE, COLORS, GREY
 
 
@@ -38,8 +38,8 @@ def test_algorithms_differ_by_dashes_alone():
 
 def test_a_score_is_drawn_with_its_interval_if_it_has_one():
     _, ax = plt.subplots()
-    plot_score(ax, 3.0, Estimate(5.0, 4.0, 7.0), color=BLUE)
-    plot_score(ax, 4.0, Estimate(1.0, float("nan"), float("nan")), color=GREY)
+    plot_score(ax, 3.0, Estimate(5.0, (4.0, 7.0)), color=BLUE)
+    plot_score(ax, 4.0, Estimate(1.0, None), color=GREY)
     plt.close(ax.figure)
     assert [line.get_xydata().tolist() for line in ax.lines] == [[[3.0, 5.0]], [[4.0, 1.0]]]
     (bars,) = ax.collections
