@@ -13,7 +13,7 @@ from rich.table import Table
 from agents.differences import DRAWS, reference_policy, return_differences
 from agents.episode_file import write_episodes
 from agents.runs import SUMMARY_FILE
-from agents.summaries import NEARLY_CONSTANT, PolicySummary, reports_only_events, summarize
+from agents.summaries import NEARLY_CONSTANT, PolicySummary, percent_digits, reports_only_events, summarize
 from agents.vec_envs import EpisodeResult
 from envs.registry import check_arguments, name_with
 from envs.rollouts.driving_measures import HARD_BRAKING_MPS2, LONGEST_S
@@ -279,7 +279,8 @@ def _cells_of(summary: PolicySummary, roles: Sequence[str]) -> list[str]:
 def _rate(rate: float | None, low: float | None, high: float | None, interval: bool) -> str:
     if rate is None or low is None or high is None:
         return NOT_REPORTED
-    return f"{100 * rate:.0f} %" + (f" ({100 * low:.0f}–{100 * high:.0f} %)" if interval else "")
+    digits = percent_digits(rate)
+    return f"{100 * rate:.{digits}f} %" + (f" ({100 * low:.{digits}f}–{100 * high:.{digits}f} %)" if interval else "")
 
 
 def _difference(found: Estimate) -> str:

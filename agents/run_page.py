@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED, Evaluation, read_evaluation
 from agents.runs import CONFIG_FILE, CURVE_FILE, OPTIONS_OF, SUMMARY_FILE, read_config, read_curve
-from agents.summaries import EXTREMES
+from agents.summaries import EXTREMES, percent_digits
 from envs.simulators.envpool import ENV_IDS
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
 from predictor.reports.figures import files_of, panels
@@ -147,7 +147,7 @@ def _summary(evaluation: Evaluation | None) -> str:
     first, reference = evaluation.summaries[0], evaluation.reference
     told = f"{first.policy}: mean return {first.return_mean:.2f} over {first.episodes} episodes"
     if first.crash_rate is not None:
-        told += f", {100 * first.crash_rate:.0f} % of them with a crash"
+        told += f", {100 * first.crash_rate:.{percent_digits(first.crash_rate)}f} % of them with a crash"
     if reference is None or reference == first.policy:
         return f"{told}."
     other = next(summary for summary in evaluation.summaries if summary.policy == reference)

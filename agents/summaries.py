@@ -69,6 +69,11 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
+def percent_digits(rate: float) -> int:
+    """Returns the number of decimals of a rate in percent: one below 1 %, as one crash in 200 is not 0 %."""
+    return 1 if 0.0 < rate < 0.01 else 0
+
+
 def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
     """Returns the mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
     array = np.asarray(values, dtype=np.float64)

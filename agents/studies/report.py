@@ -12,6 +12,7 @@ from agents.results import NOT_REPORTED
 from agents.studies.estimators import interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
+from agents.summaries import percent_digits
 from envs.drivers.planner import ORACLE, PLANNER
 from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
@@ -142,7 +143,7 @@ def _scenario(findings: Findings, scenario: str) -> list[Block]:
                 str(len(runs)) if trained else NOTHING,
                 interval(findings.mean_return(scenario, line)),
                 interval(findings.middle_return(scenario, line)) if trained else NOTHING,
-                NOT_REPORTED if crashes is None else interval(crashes, 0, 100.0, " %"),
+                NOT_REPORTED if crashes is None else interval(crashes, percent_digits(crashes.value), 100.0, " %"),
                 _number(findings.mean_of(scenario, line, "length")),
                 _number(findings.mean_of(scenario, line, "mean_speed_mps")),
             ]

@@ -39,6 +39,12 @@ def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
     return EpisodeResult(seed, (ants + bees) / 2, 5, None, math.nan, {"ant": ants, "bee": bees})
 
 
+def test_one_crash_in_200_episodes_does_not_read_0_percent(tmp_path: Path):
+    episodes = [replace(EPISODES[0], crashed=number == 0) for number in range(200)]
+    Evaluation("toy-v0", 10, {"ppo": episodes}).write(tmp_path)
+    assert " 0.5 % (0.1–2.8 %) " in (tmp_path / "summary.md").read_text()
+
+
 def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
     evaluation = Evaluation(
         "meadow", 1, {"ppo": [herd(1, 1.0, 4.0), herd(2, 3.0, 8.0)], "random": [herd(1, 0.0, 0.5)]}, False
