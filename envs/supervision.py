@@ -5,7 +5,6 @@ that the place is known even of a process that was killed.
 """
 
 import math
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
@@ -14,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from predictor.support.errors import UserError, one_line, short
+from predictor.support.errors import UserError, reason_of
 
 TIMEOUT_S = 600.0
 """Time that one step of an environment may take, in a process of its own, by default [s]."""
@@ -151,16 +150,6 @@ def named(env_id: str, place: Place) -> Iterator[None]:
 def failure(env_id: str, place: Place | str, reason: str) -> str:
     """Returns the sentence for an environment that failed."""
     return f"{env_id}, {place}: {reason}"
-
-
-def reason_of(error: BaseException) -> str:
-    """Returns an error in words: the message of a user error, else its type and the line that raised it, too."""
-    text = short(one_line(error), 500)
-    if isinstance(error, UserError):
-        return text
-    frames = traceback.extract_tb(error.__traceback__)
-    where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {text or 'no message'}{where}"
 
 
 def check_numbers(observation: Any, reward: Any = 0.0) -> None:

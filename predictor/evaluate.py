@@ -17,12 +17,13 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
-from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, name_of_folder
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.forecaster import Forecaster
+from predictor.own_forecasters import WatchedForecaster, is_own, make_own
 from predictor.reports.looks import STYLE
 from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
 from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
@@ -42,7 +43,7 @@ class EvaluateConfig:
     """Measures a predictor's accuracy on recorded episodes, beside constant velocity."""
 
     checkpoint: str
-    """Checkpoint to measure: shipped name, folder, run folder, or "constant-velocity"."""
+    """Checkpoint to measure: shipped name, folder, run folder, "constant-velocity", or own:module:function."""
     data: Path
     """Episode store that was not trained on."""
     out: Path | None = None
@@ -100,11 +101,23 @@ def _load(config: EvaluateConfig) -> _Subject:
         store = read_store(config.data)
         spec = store.info.spec
         return _Subject(store, spec, config.horizon_steps or ConstantVelocity(spec).horizon_steps)
+    if is_own(config.checkpoint):
+        return _load_own(config)
     model, info = load_checkpoint(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_recorded(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
     name = MODEL_NAMES.get(info.model, info.model)
     return _Subject(store, info.spec, config.horizon_steps or info.horizon_steps, model, info.std_m, name)
+
+
+def _load_own(config: EvaluateConfig) -> _Subject:
+    if config.device != "cpu":
+        raise UserError(f"a forecaster of your own runs on the CPU, got --device {config.device}; leave it out")
+    store, source = read_store(config.data), f"store {config.data}"
+    model = WatchedForecaster(make_own(config.checkpoint, store.info.spec, source), config.checkpoint)
+    model.spec.check_recorded(store.info.spec, f"forecaster '{config.checkpoint}'", source)
+    horizon = config.horizon_steps or model.horizon_steps
+    return _Subject(store, model.spec, horizon, model, name=name_of_folder(config.checkpoint))
 
 
 def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:

@@ -1,17 +1,34 @@
 """Forecasters of a user's own, by name: "own:module:function", or "own:NAME" of an installed package's entry point.
 
-Wrappers and every option of `envs` and `agents` that takes a checkpoint take such a name, too. What it names is a
-forecaster, or a class or function that makes one of a `SceneSpec`. Its module is imported, so such a name is code: a
-run's config alone must not bring one.
+Wrappers, every option of `envs` and `agents` that takes a checkpoint, and `predictor.evaluate` take such a name, too.
+What it names is a forecaster, or a class or function that makes one of a `SceneSpec`. Its module is imported, so such
+a name is code: a run's config alone must not bring one.
 """
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from predictor.forecaster import Forecaster, require_forecaster
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from predictor.forecaster import (
+    Belief,
+    Forecaster,
+    Futures,
+    Memory,
+    check_empty,
+    check_futures,
+    check_observed,
+    check_scale,
+    has_scale,
+    require_forecaster,
+)
+from predictor.noise import Noise
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError, named, short
+from predictor.support.errors import UserError, named, reason_of, short
 
 PREFIX = "own:"
 """Beginning of the name of a forecaster of a user's own, where a checkpoint's name is expected."""
@@ -79,6 +96,67 @@ def make_own(name: str, scene_spec: SceneSpec, source: str) -> Forecaster:
     forecaster = require_forecaster(found)
     forecaster.spec.check_compatible(scene_spec, f"forecaster '{name}'", source)
     return forecaster
+
+
+class WatchedForecaster:
+    """A forecaster of a user's own whose results are checked, and whose errors are one sentence.
+
+    Args:
+        forecaster: the forecaster; wrappers check its results themselves (`predictor.online`).
+        name: its name, for messages.
+    """
+
+    def __init__(self, forecaster: Forecaster, name: str) -> None:
+        """Takes over what the forecaster says of itself."""
+        self._forecaster, self._name = forecaster, name
+        self.spec, self.horizon_steps = forecaster.spec, forecaster.horizon_steps
+        self.num_edge_types, self.edge_feature_dim = forecaster.num_edge_types, forecaster.edge_feature_dim
+        self.has_scale = has_scale(forecaster)
+
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        """Returns the memory before the first step.
+
+        Raises:
+            UserError: the forecaster failed, or its result does not fit.
+        """
+        with self._named():
+            memory = self._forecaster.empty_memory(batch, agents)
+        check_empty(memory, batch, agents)
+        return memory
+
+    def observe(
+        self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
+    ) -> tuple[Memory, Belief]:
+        """Observes one instant.
+
+        Raises:
+            UserError: as `empty_memory`.
+        """
+        with self._named():
+            found = self._forecaster.observe(memory, states, valid)
+        check_observed(found, states, self._forecaster)
+        return found
+
+    def rollout(
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
+    ) -> Futures:
+        """Forecasts.
+
+        Raises:
+            UserError: as `empty_memory`.
+        """
+        with self._named():
+            futures = self._forecaster.rollout(belief, horizon_steps, num_samples, generator)
+        check_futures(futures, horizon_steps, num_samples, belief.states, self.spec.position_dim)
+        check_scale(futures, self._forecaster)
+        return futures
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            raise UserError(f"forecaster '{self._name}' failed: {reason_of(error)}") from error
 
 
 def _point(name: str) -> EntryPoint:

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from envs.supervision import reason_of
 from predictor.own_forecasters import PREFIX
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, reason_of
 from predictor.support.importing import load_named
 
 

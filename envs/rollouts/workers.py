@@ -17,8 +17,8 @@ from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
-from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, reason_of, share
-from predictor.support.errors import UserError
+from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, share
+from predictor.support.errors import UserError, reason_of
 from predictor.support.processes import end, follow_parent, how_it_ended, start
 
 OnError = Literal["stop", "skip"]

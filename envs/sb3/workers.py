@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
-from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, reason_of, share
-from predictor.support.errors import UserError
+from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, share
+from predictor.support.errors import UserError, reason_of
 from predictor.support.processes import end, follow_parent, how_it_ended, start
 
 CLOSE_S = 5.0

@@ -13,8 +13,7 @@ import numpy as np
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.supervision import reason_of
-from predictor.support.errors import UserError, short
+from predictor.support.errors import UserError, reason_of, short
 
 
 class ReaderProblem(Exception):

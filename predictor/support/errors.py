@@ -12,6 +12,7 @@ import select
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -85,6 +86,16 @@ def one_line(error: BaseException) -> str:
     """
     shown = "".join(letter if letter.isprintable() else " " for letter in str(error))
     return short(" ".join(shown.split()), MOST_LETTERS)
+
+
+def reason_of(error: BaseException) -> str:
+    """Returns an error in words: the message of a user error, else its type and the line that raised it, too."""
+    text = short(one_line(error), 500)
+    if isinstance(error, UserError):
+        return text
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text or 'no message'}{where}"
 
 
 def run_entry_point(main: Callable[[], None]) -> None:

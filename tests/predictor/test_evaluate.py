@@ -26,6 +26,7 @@ from predictor.reports.tables import accuracy_table, markdown_table
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import FAST_LIKE, spec, write_circles
+from tests.predictor.test_own_forecasters import NAME
 
 HEADING = (
     "| forecaster | K | ADE₁ [m] | FDE₁ [m] | minADE [m] | minFDE [m] | joint ADE [m] | joint FDE [m] | energy [m] "
@@ -197,6 +198,21 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
     assert [r["name"] for r in content["rows"]] == ["constant velocity + noise"]
     assert (out / "scenes.png").exists()
+
+
+def test_a_forecaster_of_ones_own_is_measured_by_its_name(data: Path, tmp_path: Path):
+    settings = EvaluateConfig(f"{NAME}Mine", data, num_samples=1, horizon_steps=2, out=tmp_path / "out")
+    mine, straight = evaluate(settings)
+    assert mine.name == "tests.predictor.test_own_forecasters:Mine"
+    assert replace(mine, name=straight.name, nll=straight.nll, step_errors=straight.step_errors) == straight
+    assert mine.nll == [] and (tmp_path / "out" / "scenes.png").exists()
+    with pytest.raises(UserError, match="a forecaster of your own runs on the CPU, got --device cuda; leave it out"):
+        evaluate(on_a_gpu(settings))
+
+
+def on_a_gpu(settings: EvaluateConfig) -> EvaluateConfig:
+    object.__setattr__(settings, "device", "cuda")
+    return settings
 
 
 def test_the_first_agent_of_a_recording_without_an_ego_is_not_taken_for_it(

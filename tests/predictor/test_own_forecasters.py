@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import load_forecaster, name_of_folder, require_known, resolve
-from predictor.own_forecasters import GROUP, find_own, is_own, make_own
+from predictor.forecaster import Belief, Futures
+from predictor.own_forecasters import GROUP, WatchedForecaster, find_own, is_own, make_own
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -39,6 +41,25 @@ def fails(spec: SceneSpec) -> Any:
 
 def number(spec: SceneSpec) -> Any:
     return 3
+
+
+class Raises(Mine):
+    def rollout(self, *_: Any, **__: Any) -> Any:
+        raise KeyError("weights")
+
+
+class Silent(Mine):
+    def observe(self, *_: Any) -> Any:
+        raise UserError("no map of this road; give one")
+
+
+class Short(Mine):
+    def rollout(self, belief: Belief, horizon_steps: int, *rest: Any) -> Futures:
+        return super().rollout(belief, horizon_steps - 1, *rest)
+
+
+class Vague(Mine):
+    has_scale = True
 
 
 def test_classes_functions_and_objects_have_names():
@@ -120,3 +141,19 @@ def test_an_installed_package_registers_its_own(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "thirdparty_mean.py").write_text("raise RuntimeError('there is no licence file on this machine')")
     with pytest.raises(UserError, match="'mean' cannot be imported from .*: RuntimeError: there is no licence file"):
         find_own("own:mean")
+
+
+@pytest.mark.parametrize(
+    ("made", "sentence"),
+    [
+        (Raises, r"^forecaster 'own:a' failed: KeyError: 'weights' \(.*test_own_forecasters.py, line \d+\)$"),
+        (Silent, "^forecaster 'own:a' failed: no map of this road; give one$"),
+        (Short, "^the forecaster was asked for 1 samples of 3 steps and gave 1 of 2$"),
+        (Vague, "^rollout of a forecaster gave no scale, and its has_scale is True; set has_scale = False"),
+    ],
+)
+def test_what_a_forecaster_of_ones_own_does_wrong_is_one_sentence(made: Any, sentence: str):
+    watched = WatchedForecaster(made(SPEC), "own:a")
+    with pytest.raises(UserError, match=sentence):
+        memory, belief = watched.observe(watched.empty_memory(1, 2), torch.zeros(1, 2, 4), torch.ones(1, 2).bool())
+        watched.rollout(belief, 3)
