@@ -80,9 +80,7 @@ def linear_r2(
     Returns:
         R², or None if a half has fewer than two valid entries or the targets of the scored half are all equal.
     """
-    group = np.arange(len(valid)) if groups is None else np.unique(groups, return_inverse=True)[1]
-    order = np.random.default_rng(seed).permutation(group.max(initial=-1) + 1)
-    fit = np.isin(group, order[: len(order) // 2])
+    fit = _first_half(len(valid), groups, seed)
     score = ~fit
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
     if min(len(answers), int(valid[score].sum())) < 2:
@@ -91,6 +89,13 @@ def linear_r2(
     model = sklearn("pipeline").make_pipeline(scaler, sklearn("linear_model").Ridge(penalty)).fit(known, answers)
     prediction, truth = model.predict(features[score][valid[score]]), target[score][valid[score]]
     return direct_r2(prediction, truth, np.ones(len(truth), dtype=np.bool_))
+
+
+def _first_half(entries: int, groups: Int[np.ndarray, " entries"] | None, seed: int) -> Bool[np.ndarray, " entries"]:
+    """Draws half of the groups; returns which entries are of it."""
+    group = np.arange(entries) if groups is None else np.unique(groups, return_inverse=True)[1]
+    order = np.random.default_rng(seed).permutation(group.max(initial=-1) + 1)
+    return np.isin(group, order[: len(order) // 2])
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,7 @@ def dci(
     features: Float[np.ndarray, "points dims"],
     factors: Float[np.ndarray, "points factors"],
     seed: int = 0,
+    groups: Int[np.ndarray, " points"] | None = None,
 ) -> DCI:
     """Computes DCI of features, with factors and features standardised; fitted on one half, scored on the other.
 
@@ -118,25 +124,27 @@ def dci(
     0: it would be noise, and noise in a single dimension looks perfectly disentangled. If informativeness is low, the
     other two have little meaning.
 
-    Halves are of points: where points of one episode are alike, the held-out half is not new.
+    Halves are drawn over groups, as those of `linear_r2`: points of one episode are alike, so the half that is scored
+    must not have any of an episode that was fitted.
 
     Args:
         features: features of the points, such as pairs.
         factors: known attributes of the points.
         seed: random seed of the halves.
+        groups: group of each point (its episode); None makes each one a group of its own.
 
     Raises:
         UserError: scikit-learn is not installed.
-        ValueError: there are fewer than four points.
+        ValueError: a half has fewer than two points.
     """
-    if len(features) < 4:
-        raise ValueError(f"dci needs at least 4 points, got {len(features)}")
-    order = np.random.default_rng(seed).permutation(len(features))
-    fit, score = order[: len(order) // 2], order[len(order) // 2 :]
+    fit = _first_half(len(features), groups, seed)
+    score = ~fit
+    if min(fit.sum(), score.sum()) < 2:
+        raise ValueError(f"dci needs at least 2 points in each half, got {fit.sum()} and {score.sum()}")
     scale = sklearn("preprocessing").StandardScaler
     inputs, outputs = (scale().fit(values[fit]).transform(values) for values in (features, factors))
     importance = np.zeros((features.shape[1], factors.shape[1]))
-    everything = np.ones(len(score), dtype=np.bool_)
+    everything = np.ones(score.sum(), dtype=np.bool_)
     scores = []
     for factor in range(factors.shape[1]):
         model = sklearn("linear_model").Lasso(alpha=PENALTY).fit(inputs[fit], outputs[fit, factor])

@@ -244,7 +244,7 @@ def _scores(
         "edges": relation,
         "separation": apart,
         "attributes": attributes,
-        "disentanglement": disentanglement(edges.features, edges.attributes, seed) if count else None,
+        "disentanglement": disentanglement(edges.features, edges.attributes, edges.group, seed) if count else None,
         "reading": _reading(attributes[0], edges, dimensions[0]) if count else None,
     }
 

@@ -194,15 +194,22 @@ def separation(
 
 
 def disentanglement(
-    features: Float[np.ndarray, "pairs dims"], factors: Float[np.ndarray, "pairs factors"], seed: int = 0
+    features: Float[np.ndarray, "pairs dims"],
+    factors: Float[np.ndarray, "pairs factors"],
+    groups: Int[np.ndarray, " pairs"],
+    seed: int = 0,
 ) -> Disentanglement:
-    """Computes DCI and MIG of the factors that vary."""
+    """Computes DCI and MIG of the factors that vary; the halves of DCI are of groups (episodes)."""
     if len(features) < 4:
         return Disentanglement(len(features), None, None, f"needs at least 4 edges, got {len(features)}")
     factors = factors[:, _standardised(factors).any(axis=0)]
     if not factors.shape[1]:
         return Disentanglement(len(features), None, None, "no attribute varies")
-    return Disentanglement(len(features), mig(features, factors), dci(features, factors, seed=seed))
+    try:
+        found = dci(features, factors, seed, groups)
+    except ValueError as error:
+        return Disentanglement(len(features), mig(features, factors), None, str(error))
+    return Disentanglement(len(features), mig(features, factors), found)
 
 
 class StillnessTally:

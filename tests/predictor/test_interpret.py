@@ -177,17 +177,20 @@ def test_separation_finds_a_dimension_that_is_small_on_edges():
 
 def test_copies_of_two_attributes_are_disentangled():
     factors = drawn(0, 2000, 2)
-    found = disentanglement(factors[:, ::-1].copy(), factors)
+    found = disentanglement(factors[:, ::-1].copy(), factors, np.arange(2000) // 10)
     assert found.dci is not None and found.note == ""
     assert found.dci.disentanglement == pytest.approx(1.0) and found.mig is not None and found.mig > 0.95
 
 
 def test_attributes_that_do_not_vary_are_left_out():
     factors = np.concatenate([drawn(0, PAIRS, 1), np.full((PAIRS, 1), 1.5)], axis=1)
-    found = disentanglement(drawn(1, PAIRS, 2), factors)
+    each = np.arange(PAIRS)
+    found = disentanglement(drawn(1, PAIRS, 2), factors, each)
     assert found.dci is not None and found.dci.disentanglement is None  # one factor is left
-    assert disentanglement(drawn(1, PAIRS, 2), np.ones((PAIRS, 1))).note == "no attribute varies"
-    assert disentanglement(drawn(1, 3, 2), drawn(2, 3, 1)).note == "needs at least 4 edges, got 3"
+    assert disentanglement(drawn(1, PAIRS, 2), np.ones((PAIRS, 1)), each).note == "no attribute varies"
+    assert disentanglement(drawn(1, 3, 2), drawn(2, 3, 1), each[:3]).note == "needs at least 4 edges, got 3"
+    alone = disentanglement(drawn(1, PAIRS, 2), factors, 0 * each)
+    assert alone.note == f"dci needs at least 2 points in each half, got 0 and {PAIRS}" and alone.mig is not None
 
 
 # --- Stillness --------------------------------------------------------------------------------------------------------

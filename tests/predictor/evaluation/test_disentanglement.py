@@ -180,6 +180,16 @@ def test_rotated_features_know_as_much_but_are_entangled():
     assert found.completeness == pytest.approx(0.0, abs=0.05)
 
 
+def test_halves_of_dci_are_of_whole_episodes():
+    """Features without any relation to the factors; both are the same throughout an episode."""
+    rng = np.random.default_rng(2)
+    features, known = (np.repeat(rng.normal(size=(20, size)), 50, axis=0) for size in (16, 2))
+    within, across = dci(features, known), dci(features, known, groups=np.repeat(np.arange(20), 50))
+    assert within.informativeness is not None and within.informativeness > 0.5, "the points were seen already"
+    assert across.informativeness is not None and across.informativeness < 0.0
+    assert not np.any(across.importance)
+
+
 def test_importance_says_which_dimension_holds_what():
     found = dci(factors()[:, [2, 0, 1]], factors())
     assert np.argmax(found.importance, axis=0).tolist() == [1, 2, 0]
@@ -199,7 +209,7 @@ def test_dci_depends_on_the_seed_alone():
 
 
 def test_dci_needs_points():
-    with pytest.raises(ValueError, match="dci needs at least 4 points, got 3"):
+    with pytest.raises(ValueError, match="dci needs at least 2 points in each half, got 1 and 2"):
         dci(np.zeros((3, 2)), np.zeros((3, 2)))
 
 
