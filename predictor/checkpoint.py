@@ -211,7 +211,8 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
     with named(path, name):
         info = read_info(path)
         tensors = read_weights(path / WEIGHTS, shapes_of(info.model, info.spec, info.config, info.horizon_steps))
-    model = build(info.model, info.spec, info.config, info.horizon_steps)
+    with torch.random.fork_rng(devices=[]):  # the initial weights are not kept
+        model = build(info.model, info.spec, info.config, info.horizon_steps)
     model.load_state_dict(tensors)
     return model.to(resolve_device(device)).eval(), info
 

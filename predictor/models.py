@@ -154,7 +154,7 @@ def _convert(kind: Any, value: str) -> Any:
             raise ValueError(value)
         return value
     if get_origin(kind) is tuple:
-        return tuple(float(v) for v in value.split(","))
+        return tuple(get_args(kind)[0](v) for v in value.split(","))
     return kind(value)
 
 

@@ -296,11 +296,10 @@ def _of_samples(valid: Bool[Tensor, "scenes agents"]) -> Bool[Tensor, "scenes sa
 
 def _noise(trial: Trial) -> Iterator[str]:
     _, belief = trial.observed()
-    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    before = torch.get_rng_state(), _global_numpy()
     one, two = (trial.forecaster.rollout(belief, trial.horizon, SAMPLES, trial.noise()).states for _ in range(2))
     here = _of_samples(trial.valid)
-    after = np.random.get_state()[1]  # type: ignore[index]  # noqa: NPY002
-    if not torch.equal(before[0], torch.get_rng_state()) or not np.array_equal(before[1], after):
+    if not torch.equal(before[0], torch.get_rng_state()) or _global_numpy() != before[1]:
         yield "rollout draws from torch's or NumPy's global generator; draw from the given one"
     elif trial.differ(one[here], two[here]):
         yield "rollout: equal generators must give equal samples"
@@ -314,6 +313,12 @@ def _noise(trial: Trial) -> Iterator[str]:
         if trial.differ(drawn[there], one[scene][there]):
             yield "rollout: the samples of a scene must come from its own generator, whatever the other scenes draw"
             return
+
+
+def _global_numpy() -> tuple[list[int], int, int, float]:
+    """Returns the state of NumPy's global generator: its numbers, how many of them are used, and a kept normal draw."""
+    state: Any = np.random.get_state()  # noqa: NPY002
+    return state[1].tolist(), *state[2:]
 
 
 def _place_does_not_matter(trial: Trial) -> Iterator[str]:

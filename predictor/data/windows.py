@@ -23,7 +23,7 @@ from predictor.support.errors import UserError
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
     """Returns which agents the ego (column 0) perceives at each step; all that are present, without an ego."""
-    if not spec.has_ego:
+    if not spec.has_ego or not len(episode.ids):
         return episode.valid
     order, seen = perceived_agents(episode.states, episode.valid, 0, spec)
     perceived = np.zeros_like(episode.valid)
@@ -61,6 +61,11 @@ class Windows:
         first = np.concatenate([[0], np.cumsum([len(e.states) for e in episodes], dtype=np.int64)])
         kept = np.concatenate([np.zeros(0, np.bool_), *(foreseeable(e, horizon_steps) for e in episodes)])
         self.index = index[kept[first[index[:, 0]] + index[:, 1]]]
+        if len(index) and not len(self.index):
+            raise UserError(
+                f"no window fits: in each of the {len(index)} that are long enough an intervention begins within the "
+                "horizon, which nobody can foresee; lower the horizon, or record episodes with fewer interventions"
+            )
         if not len(self.index):
             raise UserError(
                 f"no window fits: episodes have at most {lengths.max(initial=0)} steps, "

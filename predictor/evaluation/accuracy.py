@@ -167,9 +167,9 @@ class Tally:
         counts = {key: np.concatenate(parts) for key, parts in self._counts.items()}
         counts = {key: count for key, count in counts.items() if count.any() or key not in OPTIONAL}
         sums = {key: np.concatenate(self._sums[key]) for key in counts}
-        whole = {key: _ratio(sums[key].sum(), counts[key].sum()) for key in counts}
+        whole = {key: ratio(sums[key].sum(), counts[key].sum()) for key in counts}
         steps = {
-            key: [_ratio(s, c) for s, c in zip(sums[key].sum(0), counts[key].sum(0), strict=True)]
+            key: [ratio(s, c) for s, c in zip(sums[key].sum(0), counts[key].sum(0), strict=True)]
             for key in counts
             if counts[key].ndim == 2
         }
@@ -332,7 +332,8 @@ def fitted_std_m(outcomes: Iterable[Outcome]) -> tuple[float, ...]:
     return tuple(variance.sqrt().clamp(min=1e-3).tolist())
 
 
-def _ratio(total: float, count: float) -> float:
+def ratio(total: float, count: float) -> float:
+    """Returns total / count; NaN where nothing was counted."""
     return float(total / count) if count else math.nan
 
 

@@ -146,15 +146,15 @@ def coverage(
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
     """Returns 1 where the truth is as near to the samples' mean as the central `share` of the samples, else 0.
 
-    The mean is `share` if the samples are spread like the truth, less if their spread is too small, more if it is too
-    large. The distance of the truth to the samples' mean is compared with the `share`-quantile of the samples'
+    Of draws, the mean is `share` if they are spread like the truth, less if they are nearer together, more if they are
+    further apart. The distance of the truth to the samples' mean is compared with the `share`-quantile of the samples'
     distances. For few draws, a draw's distance is to the mean of the *other* draws, since the mean does not include
     the truth either (K/(K−1) times the distance to the mean of all), and the quantile is the value of rank share·(K+1),
     linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage). Forecasters deliver the single forecast as
     sample 0, which is nearer to the mean than a draw: with it the mean is 0.886 for 9 samples of the truth's spread,
-    0.895 for 20. Modes with probabilities are no draws but the
-    distribution itself: the mean is weighted, and the truth is inside if less than `share` of the probability is nearer
-    to the mean.
+    0.895 for 20. Modes with probabilities are no draws but the distribution itself: the mean is weighted, and the truth
+    is inside if less than `share` of the probability is nearer to the mean. Their mean is not `share` where they are
+    right: it depends on how unequal they are and on the spread around each, which counts in `mixture_coverage` alone.
 
     Args:
         forecast: sampled positions [m].

@@ -26,7 +26,7 @@ from predictor.data.nba import DT_S, FEATURES, METRES_PER_FOOT
 from predictor.data.store import EpisodeStore
 from predictor.data.windows import Windows
 from predictor.evaluation import displacement as metrics
-from predictor.evaluation.accuracy import fitted_std_m
+from predictor.evaluation.accuracy import fitted_std_m, ratio
 from predictor.evaluation.energy_score import energy_score
 from predictor.evaluation.outcomes import Outcome, noise_of_windows, run_window_batch
 from predictor.evaluation.standard_errors import batch_interval
@@ -185,7 +185,7 @@ class PlayerTally:
 
     def errors(self, name: str, seconds: float = 0.0) -> PlayerErrors:
         """Returns the means over everything that was added, in feet."""
-        means = {key: float(self._sums[key].sum() / max(1.0, self._counts[key].sum())) for key in self._sums}
+        means = {key: ratio(self._sums[key].sum(), self._counts[key].sum()) for key in self._sums}
         limits = {key: batch_interval(self._sums[key], self._counts[key]) for key in self._sums}
         measured = bool(self._counts["coverage"].any())
         return PlayerErrors(

@@ -68,7 +68,7 @@ class Outcome:
         kept: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            kept[field.name] = None if value is None else value[-count:]
+            kept[field.name] = None if value is None else value[max(0, len(value) - count) :]
         return Outcome(**kept)
 
     def tail(self, steps: int) -> "Outcome":

@@ -55,10 +55,11 @@ def check_count(count: int, name: str, each_bytes: int = ITEM_BYTES) -> None:
 
     Args:
         count: number of things; 0 always fits.
-        name: name of the option, for the message.
+        name: name of the option, or of several that are multiplied ("episodes times max_steps"), for the message.
         each_bytes: least size of each.
 
     Raises:
         UserError: they do not fit.
     """
-    check_memory(count * each_bytes, f"{name}={count:,}", f"pass a smaller --{name.replace('_', '-')}")
+    options = " or ".join(f"--{option.replace('_', '-')}" for option in name.split(" times "))
+    check_memory(count * each_bytes, f"{name}={count:,}", f"pass a smaller {options}")

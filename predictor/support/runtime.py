@@ -19,6 +19,11 @@ from predictor.support.errors import UserError
 Precision = Literal["float32", "bfloat16"]
 """Precision of products: "bfloat16" rounds their inputs and results; weights, states and losses stay float32."""
 
+_OF_ONEDNN: Literal["medium"] = "medium"
+"""torch's precision of products with which it uses oneDNN."""
+_before_onednn: list[str] = []
+"""The precision that `prefer_onednn` replaced, if it did."""
+
 # glibc's <malloc.h>
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 _LARGEST = 2**31 - 1
@@ -50,11 +55,14 @@ def tune(device: str = "cpu") -> None:
     """Sets a process up for speed: freed memory is kept, matrix products use the faster library.
 
     Args:
-        device: device of the tensors; on CUDA the library is not set, since that would let products round to TF32.
+        device: device of the tensors; on CUDA the library is not set, and set back if it was, since that would let
+            products round to TF32.
     """
     keep_freed_memory()
     if device == "cpu":
         prefer_onednn()
+    elif _before_onednn:
+        torch.set_float32_matmul_precision(_before_onednn.pop())
 
 
 @cache
@@ -72,21 +80,25 @@ def keep_freed_memory() -> bool:
     return all(mallopt(option, value) == 1 for option, value in options.items())
 
 
-@cache
 def prefer_onednn() -> bool:
-    """Makes torch use oneDNN for float32 matrix products where its default, MKL, is slow; returns whether it does.
+    """Makes torch use oneDNN for float32 matrix products where its default, MKL, is slow; returns whether it does."""
+    if _onednn_is_better() and (before := torch.get_float32_matmul_precision()) != _OF_ONEDNN:
+        _before_onednn[:] = [before]
+        torch.set_float32_matmul_precision(_OF_ONEDNN)
+    return _onednn_is_better()
+
+
+@cache
+def _onednn_is_better() -> bool:
+    """Returns whether oneDNN is faster here, and as exact.
 
     MKL uses its AVX-512 kernels on Intel's processors only; on AMD's, oneDNN is twice as fast. torch uses oneDNN only
     if it may round inputs to bfloat16, so this is set only where a test shows that oneDNN does not.
     """
     if "AuthenticAMD" not in _cpu_info("vendor_id") or torch.backends.cpu.get_cpu_capability() != "AVX512":
         return False
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium")
-    if _products_are_exact():
-        return True
-    torch.set_float32_matmul_precision(before)
-    return False
+    with float32_products(_OF_ONEDNN):
+        return _products_are_exact()
 
 
 def _products_are_exact() -> bool:
@@ -109,7 +121,7 @@ def precision(kind: Precision, device: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def float32_products(kind: Literal["highest", "high"]) -> Iterator[None]:
+def float32_products(kind: Literal["highest", "high", "medium"]) -> Iterator[None]:
     """Sets torch's precision of products of float32 inside the block; "high" lets CUDA round their inputs to TF32."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(kind)

@@ -60,7 +60,8 @@ class TrainConfig:
     random weights."""
     refit_scales: bool = False
     """Whether the scales of `init` are fitted to the data anew, for data that spread otherwise than those it was
-    trained on; the weights change along, so that forecasts stay the same but for the geometry of edges."""
+    trained on; the weights change along, so that forecasts stay the same but for the geometry of edges and the spread
+    of modes (`Forecast.xy_scale`)."""
     only_spread: bool = False
     """Whether to train the spread of the modes alone (`Forecast.xy_scale`): the forecasts of `init` and their
     probabilities stay as they are, and the likelihood of the mixture selects the checkpoint."""
@@ -132,7 +133,8 @@ class TrainConfig:
     val_fraction: float = 0.1
     """Share of episodes held out for model selection; of recordings, where the store is stretches of these."""
     val_windows: int = 1500
-    """Number of held-out windows measured for model selection."""
+    """Number of held-out windows measured for model selection at most: an equal share from each store of `data`,
+    however large it is."""
     eval_every: int = 250
     """Number of optimiser steps between validations, at which the training state is saved too."""
     patience: int = 8

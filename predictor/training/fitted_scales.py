@@ -46,7 +46,9 @@ def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[flo
     """
     axes, distances, speeds = spec.position_dim, [], []
     for episode in episodes:
-        steps = max(1, _MOST_PAIRS // max(1, len(episode.ids)) ** 2)  # a whole recording has thousands of ids
+        if len(episode.ids) < 2:
+            continue
+        steps = max(1, _MOST_PAIRS // len(episode.ids) ** 2)  # a whole recording has thousands of ids
         whole = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
         for states, valid in zip(*(t.split(steps) for t in whole), strict=True):
             place = states[..., :axes]

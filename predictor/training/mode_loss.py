@@ -34,8 +34,8 @@ def energy_terms(
 
     The distance of two futures of an agent is the mean over valid steps of the distance of their positions plus half
     that of their other features. The distance of two scenes at a step is the root of the sum over agents of squared
-    distances of positions, divided by the root of the number of agents; a scene's probability is the mean of its
-    agents'.
+    distances of positions of the agents that are there, divided by the root of the number of agents that are there at
+    any step; a scene's probability is the mean of its agents'.
 
     Args:
         modes: enumerated futures.

@@ -27,7 +27,7 @@ _SAME = 1e-3
 
 
 def rescaled(model: nn.Module, name: str, scales: dict[str, tuple[float, ...]], horizon_steps: int) -> Any:
-    """Builds a copy of a dG-VAE with other scales, which forecasts the same but for the geometry of its edges.
+    """Builds a copy of a dG-VAE with other scales; only geometry of edges and spread of modes change its forecasts.
 
     Args:
         model: network whose scales are replaced.

@@ -21,7 +21,7 @@ from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluate import EvaluateConfig
 from predictor.suite import SuiteConfig
 from predictor.support.errors import UserError
-from predictor.support.memory import check_memory, memory_bytes
+from predictor.support.memory import check_count, check_memory, memory_bytes
 from predictor.training.batches import check_batch, open_batches
 from predictor.training.config import TrainConfig
 from tests.predictor.helpers import write_circles
@@ -69,6 +69,11 @@ def test_the_limit_is_what_there_is():
     check_memory(2**30, "a store", "make it smaller", available_bytes=2**30)
     with pytest.raises(UserError, match=r"^a store needs at least 2.0 GiB, and there are 1.0 GiB; make it smaller$"):
         check_memory(2**31, "a store", "make it smaller", available_bytes=2**30)
+
+
+def test_all_options_that_are_multiplied_are_named():
+    with pytest.raises(UserError, match=r"pass a smaller --horizon-steps or --num-samples$"):
+        check_count(10**16, "horizon_steps times num_samples")
 
 
 def test_a_batch_is_estimated_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -94,6 +94,12 @@ def test_loaded_model_forecasts_what_the_saved_one_did(path: Path):
     assert torch.equal(*forecasts)
 
 
+def test_loading_draws_nothing_from_torchs_global_generator(path: Path):
+    before = torch.get_rng_state()
+    load_checkpoint(path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_loaded_model_is_in_evaluation_mode(path: Path):
     assert not load_checkpoint(path)[0].training
 

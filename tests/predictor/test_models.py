@@ -82,6 +82,7 @@ def test_fast_presets():
         ("dgvae", "residual=trapezoid", "residual", "trapezoid"),
         ("dgvae", "pair_matching=window", "pair_matching", "window"),
         ("dgvae", "delta_scales=0.1,0.2,3,4e-1", "delta_scales", (0.1, 0.2, 3.0, 0.4)),
+        ("dgvae", "feature_labels=leader,time_gap_s", "feature_labels", ("leader", "time_gap_s")),
         ("lstm", "joint=True", "joint", True),
         ("lstm", "num_agents=5", "num_agents", 5),
         ("imma", "num_layers=3", "num_layers", 3),

@@ -93,6 +93,15 @@ class Global(Smooth):
         return Futures(states)
 
 
+class OfNumPy(Smooth):
+    """Draws a few numbers from NumPy's own generator."""
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        states = super().rollout(belief, horizon_steps, num_samples).states
+        states[:, 1:] += torch.as_tensor(np.random.normal(size=3)[0])  # noqa: NPY002
+        return Futures(states)
+
+
 class FirstGenerator(Smooth):
     """Draws for all scenes from the first one's generator."""
 
@@ -244,6 +253,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "nan": (changed_rollout(lambda s: s * float("nan")), "rollout: states of agents that are there must be finite"),
     "axes": (changed_rollout(lambda s: s.transpose(1, 2)), "samples): states must have the shape (3, 1, 4, 4, 4)"),
     "horizon": (changed_rollout(lambda s: s[..., :1, :]), "states must have the shape (3, 1, 4, 4, 4)"),
+    "noise of NumPy": (OfNumPy, "rollout draws from torch's or NumPy's global generator; draw from the given one"),
     "global noise": (Global, "rollout draws from torch's or NumPy's global generator; draw from the given one"),
     "shared noise": (FirstGenerator, "rollout: the samples of a scene must come from its own generator"),
     "noisy single": (NoisySingle, "rollout: sample 0 is the single forecast and must not depend on the generator"),

@@ -11,6 +11,7 @@ from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows, concatenate, siblings, split_episodes, visible
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
+from predictor.training.fitted_scales import typical_neighbour
 from tests.predictor.helpers import random_presence, random_states, spec
 
 
@@ -194,6 +195,21 @@ def test_leaving_ego_is_refused():
 def test_episodes_without_a_window_are_refused(episodes: list[Episode], message: str):
     with pytest.raises(UserError, match=message):
         Windows(episodes, spec(), 3, 2)
+
+
+def test_windows_that_no_intervention_leaves_are_told_from_short_episodes():
+    steps = along_x([0.0] * 5)
+    kicked = replace(steps, perturbed=np.array([[0], [1], [0], [1], [0]], dtype=np.int8))
+    with pytest.raises(UserError, match="no window fits: in each of the 3 that are long enough an intervention begins"):
+        Windows([kicked], spec(), 1, 2, min_future_steps=2)
+
+
+def test_episodes_without_agents_have_windows_without_agents():
+    nobody = Episode(np.zeros((3, 0, 4), np.float32), np.zeros((3, 0), np.bool_), np.zeros(0, np.int64))
+    for has_ego in (True, False):
+        windows = Windows([nobody, along_x([0.0, 1.0, 2.0])], spec(has_ego=has_ego), 1, 1)
+        assert windows.index[:, 0].tolist() == [0, 0, 1, 1]
+        assert typical_neighbour([nobody], windows.spec) == ()
 
 
 # --- Length of the history --------------------------------------------------------------------------------------------
