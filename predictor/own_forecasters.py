@@ -5,7 +5,6 @@ What it names is a forecaster, or a class or function that makes one of a `Scene
 a name is code: a run's config alone must not bring one.
 """
 
-import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
@@ -29,6 +28,7 @@ from predictor.forecaster import (
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError, named, reason_of, short
+from predictor.support.importing import import_module
 
 PREFIX = "own:"
 """Beginning of the name of a forecaster of a user's own, where a checkpoint's name is expected."""
@@ -51,12 +51,7 @@ def find_own(name: str) -> Any:
     if ":" not in what:
         return _registered(what)
     module, _, attribute = what.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute, None)
-    except (ImportError, ValueError) as error:
-        raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {error}") from error
-    except (Exception, SystemExit) as error:  # whatever the module does
-        raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {named(error)}") from error
+    found = getattr(import_module(module, f"forecaster '{short(name)}'"), attribute, None)
     if found is None:
         raise UserError(f"module '{short(module)}' has no '{short(attribute)}' for forecaster '{short(name)}'")
     return found

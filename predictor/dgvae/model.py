@@ -29,7 +29,7 @@ from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.motion import Context, Motion
 from predictor.dgvae.networks import Decoder, Encoder, concrete_sample, edge_probabilities
 from predictor.dgvae.packing import Packed, Padded
-from predictor.dgvae.planned_run import PlannedRun
+from predictor.dgvae.planned_run import PlannedRun, Start
 from predictor.dgvae.reading import Reading
 from predictor.dgvae.self_edges import SelfEdges
 from predictor.dgvae.single_step import Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
@@ -190,17 +190,10 @@ class DGVAE(nn.Module):
         draws = num_samples - 1
         steps = horizon_steps if self.config.rollout_graph == "evolving" else 1
         noise = noise_of_pairs(generator, graph.pairs_there, draws, steps, self.num_edge_types)
-        states, valid, seen = (
-            t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, known.past.seen)
-        )
-        hidden, cell, static, features, logits = (
-            graph.repeat_pairs(t, draws)
-            for t in (known.past.hidden, known.past.cell, known.past.static, known.features, known.logits)
-        )
-        node = graph.repeat_nodes(known.node_before, draws)
+        start = Start(belief.valid, graph, known.past, known.node_before, known.logits, known.features).repeat(draws)
         drawn = free_run(
-            self._reading, motion, layers, states, valid, graph.repeat(draws), features,
-            Past(hidden, cell, static, seen), node, logits, horizon_steps, self._sampler(noise),
+            self._reading, motion, layers, belief.states.repeat_interleave(draws, dim=0), start.valid, start.graph,
+            start.features, start.past, start.node, start.edges, horizon_steps, self._sampler(noise),
         )  # fmt: skip
         return Futures(torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1))
 

@@ -49,12 +49,12 @@ class PlannedRun(NamedTuple):
             sampler: function that makes a rule from noise, which draws edge types from logits.
         """
         known, count = self.known, self.plans.shape[1]
-        start = _Start(self.valid, known.graph, known.past, known.node_after, known.probs, known.features)
+        start = Start(self.valid, known.graph, known.past, known.node_after, known.probs, known.features)
         single = self._proceed(start, known.next_states, self.plans, None)[:, :, None]
         if num_samples == 1:
             return Futures(single)
         draws, layers = num_samples - 1, known.layers
-        now = _Start(self.valid, known.graph, known.past, known.node_before, known.logits, known.features)
+        now = Start(self.valid, known.graph, known.past, known.node_before, known.logits, known.features)
         now = now.repeat(draws)
         drawn = now.graph.per_pair(sampler(noise), now.edges)
         context = Context(now.graph, drawn, layers.feature_share(now.features))
@@ -67,7 +67,7 @@ class PlannedRun(NamedTuple):
         return Futures(torch.cat([single, sampled], dim=2))
 
     def _proceed(
-        self, start: "_Start", states: Tensor, plans: Tensor, rule: Callable[[Tensor], Tensor] | None
+        self, start: "Start", states: Tensor, plans: Tensor, rule: Callable[[Tensor], Tensor] | None
     ) -> Float[Tensor, "batch plans agents horizon state"]:
         """Rolls out from predicted states, a scene for each plan."""
         count, horizon_steps = plans.shape[1:3]
@@ -110,7 +110,7 @@ class PlannedRun(NamedTuple):
         return Futures(states.unflatten(1, by_plan), probs, motion.spread(growth).unflatten(1, by_plan))
 
 
-class _Start(NamedTuple):
+class Start(NamedTuple):
     """Data from which a model without modes rolls out; `edges` are weights or logits."""
 
     valid: Tensor
@@ -120,14 +120,14 @@ class _Start(NamedTuple):
     edges: Tensor
     features: Tensor
 
-    def repeat(self, times: int) -> "_Start":
+    def repeat(self, times: int) -> "Start":
         """Repeats each scene."""
         graph, past = self.graph, self.past
         pairs = (graph.repeat_pairs(t, times) for t in (past.hidden, past.cell, past.static, self.edges, self.features))
         hidden, cell, static, edges, features = pairs
         valid, seen = (t.repeat_interleave(times, dim=0) for t in (self.valid, past.seen))
         node = graph.repeat_nodes(self.node, times)
-        return _Start(valid, graph.repeat(times), Past(hidden, cell, static, seen), node, edges, features)
+        return Start(valid, graph.repeat(times), Past(hidden, cell, static, seen), node, edges, features)
 
 
 def _plans_of(graph: Padded | Packed, plans: int) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:

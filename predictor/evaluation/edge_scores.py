@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.evaluation.disentanglement import DCI, dci, direct_r2, linear_r2, mig, sklearn
+from predictor.evaluation.causal_graph import roc_auc
+from predictor.evaluation.disentanglement import DCI, dci, direct_r2, linear_r2, mig
 
 SHUFFLES = 100
 CHANCE_QUANTILE = 0.95
@@ -176,8 +177,7 @@ def rank_statistic(values: Float[np.ndarray, "pairs dims"], exists: Bool[np.ndar
     with_edge, without = int(exists.sum()), int((~exists).sum())
     if not with_edge or not without:
         raise ValueError(f"pairs with and without an edge are needed, got {with_edge} with and {without} without")
-    area = sklearn("metrics").roc_auc_score
-    return [float(area(exists, column)) for column in values.T]
+    return [float(roc_auc(column, exists, np.ones((1, len(column))))[0]) for column in values.T]
 
 
 def separation(
