@@ -167,10 +167,31 @@ def unflatten(env: Any, observation: NDArray[Any], agent: str | None = None) -> 
     return entries
 
 
-def refuse_reader(reader: Any, wrapper: str) -> None:
-    """Raises a `UserError` if a wrapper whose environments report their scenes is given a reader."""
+def refuse_twice(env: Any, kind: type, wrapper: str) -> None:
+    """Checks that nothing inside of a wrapper adds forecasts already, which a flattened observation does not show.
+
+    What is below a wrapper with `takes_out_forecasts` is not looked at: that one shows the environment's own
+    observation.
+
+    Args:
+        env: environment that it wraps.
+        kind: class of the wrappers of such environments.
+        wrapper: its name, for the message.
+
+    Raises:
+        UserError: something does.
+    """
+    while isinstance(env, kind) and not getattr(type(env), "takes_out_forecasts", False):
+        if isinstance(env, ForecastWrapper):
+            name = type(env).__name__
+            raise UserError(f"{wrapper} would add forecasts to those of {name} inside; leave one of them out")
+        env = env.env  # type: ignore[attr-defined]
+
+
+def refuse_reader(reader: Any, wrapper: str, how: str) -> None:
+    """Raises a `UserError` if a wrapper whose environments report their scenes is given a reader; `how` to give it."""
     if reader is not None:
         raise UserError(
             f"{wrapper} takes no reader: its environments report their scenes, possibly from other processes; give "
-            "reader= to SceneObservation, for example with wrapper_kwargs={'reader': ...} of make_vec_env"
+            f"reader= to SceneObservation, {how}"
         )

@@ -11,6 +11,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 
 from envs.entries import SCENE_KEYS, ego_entries, entry_spaces, path_entries, what_if_entries
+from envs.own_observation import carries_forecasts
 from envs.plans.batch import PlanBatch
 from envs.plans.playing import as_forecast
 from envs.registry import checkpoint_for
@@ -60,18 +61,42 @@ def carries_scenes(space: gym.Space) -> bool:
     return isinstance(space, gym.spaces.Dict) and all(key in space.spaces for key in SCENE_KEYS)
 
 
-def require_scenes(space: gym.Space, wrapper: str) -> gym.spaces.Dict:
+def require_scenes(space: gym.Space, wrapper: str, how: str) -> gym.spaces.Dict:
     """Returns the space, which must be a Dict that carries scenes.
 
+    Args:
+        space: observation space of the environments.
+        wrapper: name of the wrapper, for the message.
+        how: how to make environments that report scenes, for the message.
+
     Raises:
-        UserError: it is not; the message says how to add scenes.
+        UserError: it is not.
     """
+    if carries_forecasts(space):
+        raise UserError(
+            f"{wrapper} makes the forecasts of all environments itself, but these have theirs already; give each "
+            "SceneObservation in the place of ForecastObservation, or leave one of two such wrappers out"
+        )
     if not isinstance(space, gym.spaces.Dict) or not carries_scenes(space):
         raise UserError(
-            f"{wrapper} needs environments that report scenes, got {type(space).__name__} observations; "
-            "make them with wrapper_class=SceneObservation (envs.wrappers)"
+            f"{wrapper} needs environments that report scenes, got {type(space).__name__} observations without them; "
+            f"{how}, with wrappers that change observations inside of SceneObservation"
         )
     return space
+
+
+def require_scenes_of(spec: SceneSpec, space: gym.spaces.Dict, wrapper: str) -> None:
+    """Checks that scenes arrive as `SceneObservation` made them.
+
+    Raises:
+        UserError: a wrapper has changed their spaces.
+    """
+    for key, made in scene_spaces(spec).items():
+        if space[key].shape != made.shape:
+            raise UserError(
+                f"{wrapper}: a wrapper around SceneObservation changed '{key}' from the shape {made.shape} to "
+                f"{space[key].shape}; put it inside of SceneObservation, or around {wrapper}"
+            )
 
 
 def open_forecaster(

@@ -88,6 +88,19 @@ def check_unwrapped(space: gym.Space, source: str) -> None:
         own_spaces(space, source)
 
 
+def check_returned(returned: Any, method: str, source: str) -> None:
+    """Checks that an environment's `reset` or `step` returned what Gymnasium's return, not older ones.
+
+    Raises:
+        UserError: it returned something else.
+    """
+    wanted = {"reset": "(observation, info)", "step": "(observation, reward, terminated, truncated, info)"}[method]
+    count = wanted.count(",") + 1
+    if not isinstance(returned, tuple) or len(returned) != count or not isinstance(returned[-1], Mapping):
+        got = f"{len(returned)} values" if isinstance(returned, tuple) else type(returned).__name__
+        raise UserError(f"{method} of {source} must return {wanted}, got {got}")
+
+
 def own_entries(observation: Any) -> dict[str, Any]:
     """Returns an environment's own observation as entries, in a new dict."""
     return dict(observation) if isinstance(observation, Mapping) else {OWN_KEY: observation}

@@ -24,7 +24,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.arms import Arm, arm_of
 from envs.batched_forward import BatchedForward, can_share
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_twice
 from envs.kinds import require_kind
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene, require_indexed
 from envs.observation import open_forecaster
@@ -103,6 +103,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
         require_kind(env, (ParallelEnv, "a PettingZoo parallel env"), "ForecastParallelEnv")
+        refuse_twice(env, BaseParallelWrapper, "ForecastParallelEnv")
         BaseParallelWrapper.__init__(self, env)
         check_bounds(perception_m, max_agents)
         self._source = f"env '{multiagent_env_id(env)}'"

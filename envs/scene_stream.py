@@ -80,6 +80,9 @@ class SceneStream:
         envs: number of parallel environments.
         config: settings of the forecast.
 
+    Raises:
+        UserError: the forecaster is of another spec (features, dt).
+
     Attributes:
         scene_spec: layout of the scenes.
         config: settings of the forecast.
@@ -92,6 +95,7 @@ class SceneStream:
 
     def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, envs: int, config: ForecastConfig) -> None:
         """Starts with empty memory."""
+        forecaster.spec.check_compatible(scene_spec, "the forecaster", "the stream of scenes")
         self.scene_spec = scene_spec
         self.config = config
         self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
@@ -100,6 +104,7 @@ class SceneStream:
         self.seen: SceneBatch | None = None
         self._front = int(forecaster.spec.has_ego and not scene_spec.has_ego)
         agents = self._front + scene_spec.max_agents
+        check_count(config.num_samples, "num_samples", 8 * envs * agents * self.horizon_steps)
         self._online = OnlineForecaster(forecaster, envs, agents, config.device, config.max_rows)
         self._noise = EnvNoise([config.seed + env for env in range(envs)])
         self._before: Sequence[np.random.Generator] = self._noise

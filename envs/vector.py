@@ -25,6 +25,7 @@ from envs.observation import (
     observe_ended,
     open_forecaster,
     require_scenes,
+    require_scenes_of,
     scenes_from,
 )
 from envs.own_observation import own_part
@@ -35,6 +36,9 @@ from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch, SceneSpec
 from predictor.support.errors import UserError
+
+_WITH_SCENES = "make them with gym.make_vec(id, num_envs, wrappers=[SceneObservation])"
+_WITH_READER = "with wrappers=[functools.partial(SceneObservation, reader=...)] of gym.make_vec"
 
 
 class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
@@ -88,10 +92,11 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         """Loads the forecaster and extends the observation space."""
         require_kind(env, VECTOR, "VectorForecast")
         gym.vector.VectorWrapper.__init__(self, env)
-        refuse_reader(reader, "VectorForecast")
+        refuse_reader(reader, "VectorForecast", _WITH_READER)
         _refuse_lists(env)
-        space = require_scenes(env.single_observation_space, "VectorForecast")
+        space = require_scenes(env.single_observation_space, "VectorForecast", _WITH_SCENES)
         spec: SceneSpec = common_value(_attribute_of_each(env, "scene_spec"), "scene spec")
+        require_scenes_of(spec, space, "VectorForecast")
         source: str = common_value(_attribute_of_each(env, "scene_source"), "env id")
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps
@@ -111,6 +116,18 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         self._mode = getattr(base, "autoreset_mode", told)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
         self._entries: Observations = {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """Returns a copy with its own environments, history and noise.
+
+        Raises:
+            UserError: the environments run in processes of their own.
+        """
+        if isinstance(self.unwrapped, gym.vector.AsyncVectorEnv):
+            raise UserError(
+                "environments in processes of their own (AsyncVectorEnv) cannot be copied; use SyncVectorEnv"
+            )
+        return super().__deepcopy__(memo)
 
     @property
     def scene(self) -> SceneBatch:

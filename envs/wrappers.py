@@ -8,6 +8,7 @@
 (11, 5, 2)
 """
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
 from envs.arms import Arm, arm_of
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader, refuse_twice
 from envs.kinds import SINGLE, refuse_autoreset, require_kind
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
-from envs.own_observation import check_own, check_reward, own_entries, own_part, own_spaces
+from envs.own_observation import check_own, check_returned, check_reward, own_entries, own_part, own_spaces
 from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
@@ -35,13 +36,23 @@ from predictor.support.errors import ProtocolError, UserError
 def scene_source(env: gym.Env) -> str:
     """Returns the name of an env, for messages and for picking its checkpoint: its id, else its class."""
     spec = env.unwrapped.spec
-    return spec.id if spec is not None else type(env.unwrapped).__name__
+    return str(getattr(spec, "id", type(env.unwrapped).__name__))
 
 
 def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float | None, max_agents: int | None) -> Any:
     if make_reader is None:
         return reader_for(env, perception_m, max_agents)
     return bounded(build_reader(make_reader, env), perception_m, max_agents)
+
+
+def _refuse_hidden_scenes(env: gym.Env) -> None:
+    while isinstance(env, gym.Wrapper) and not getattr(type(env), "takes_out_forecasts", False):
+        if isinstance(env, SceneObservation):
+            raise UserError(
+                "a wrapper around SceneObservation hides its scenes from ForecastObservation; put it inside of "
+                "SceneObservation, or around ForecastObservation"
+            )
+        env = env.env
 
 
 class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
@@ -82,7 +93,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
         self._played: int | None = 0
-        self._over = False
+        self._over = self._warned = False
         self.observation_space = gym.spaces.Dict({**own, **scene_spaces(self.reader.spec)})
 
     @property
@@ -129,7 +140,10 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             UserError: the first observation does not lie in the env's own space.
         """
         restore_idm_constants(self.env)
-        obs, info = self.env.reset(seed=seed, options=options)
+        returned = self.env.reset(seed=seed, options=options)
+        if "reset" in self._unchecked:
+            check_returned(returned, "reset", f"env '{self.scene_source}'")
+        obs, info = returned
         if "reset" in self._unchecked:
             check_own(self._own_spaces, obs, f"env '{self.scene_source}'")
             self._unchecked.remove("reset")
@@ -139,7 +153,17 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the env and reads the scene."""
-        obs, reward, terminated, truncated, info = self.env.step(action)
+        if self._over and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"step() of env '{self.scene_source}' was called after an episode's end, without reset(): what follows "
+                "is forecast with the history of the episode that ended",
+                stacklevel=2,
+            )
+        returned = self.env.step(action)
+        if "step" in self._unchecked:
+            check_returned(returned, "step", f"env '{self.scene_source}'")
+        obs, reward, terminated, truncated, info = returned
         if "step" in self._unchecked:
             check_reward(reward, f"env '{self.scene_source}'")
             self._unchecked.remove("step")
@@ -177,7 +201,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             if self._ego_id not in (None, first):
                 raise UserError(
                     f"{name}: the first agent was {self._ego_id} and is now {first}; it must be the ego until the "
-                    "episode ends: leave an ego that is gone where it was, at rest, or end the episode"
+                    "episode ends: leave an ego that is gone where it was, at rest, or end the episode, and begin the "
+                    "next by the reset() of this wrapper"
                 )
             self._ego_id = first
         self._scene = scene.copy()  # a reader may give the simulator's own arrays, into which the next reset writes
@@ -246,6 +271,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         """Loads the forecaster and extends the observation space."""
         require_kind(env, SINGLE, "ForecastObservation")
         refuse_autoreset(env, "ForecastObservation")
+        refuse_twice(env, gym.Wrapper, "ForecastObservation")
         checkpoint = str(checkpoint) if isinstance(checkpoint, Path) else checkpoint  # a spec is JSON
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
@@ -261,9 +287,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         num_plans = len(plan_model.names) if plan_model is not None and what_if else 0
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         ready = carries_scenes(env.observation_space)
+        if not ready:
+            _refuse_hidden_scenes(env)
         source = scene_source(env)
         if ready:
-            refuse_reader(reader, "ForecastObservation over a SceneObservation")
+            refuse_reader(reader, "ForecastObservation over a SceneObservation", "SceneObservation(env, reader=...)")
             spec: SceneSpec = env.get_wrapper_attr("scene_spec")
             if perception_m not in (None, spec.perception_m) or max_agents not in (None, spec.max_agents):
                 raise UserError(

@@ -18,6 +18,7 @@ from predictor.graph import NO_AGENT
 from predictor.noise import Noise, TrainingNoise
 from predictor.scene import SceneSpec, dense_edges
 from predictor.support.errors import UserError, short
+from predictor.support.signatures import takes
 
 
 @dataclass(frozen=True)
@@ -220,6 +221,14 @@ class Forecaster(Protocol):
         """
 
 
+_ARGUMENTS = {
+    "empty_memory": "batch, agents",
+    "observe": "memory, states, valid",
+    "rollout": "belief, horizon_steps, num_samples, generator",
+}
+"""Arguments with which the methods of a forecaster are called."""
+
+
 def require_forecaster(given: Any) -> Forecaster:
     """Returns `given`, which must have what a `Forecaster` has.
 
@@ -235,12 +244,18 @@ def require_forecaster(given: Any) -> Forecaster:
             f"a forecaster needs {', '.join(parts)} (predictor.forecaster.Forecaster), but {type(given).__name__} has "
             f"no {', '.join(missing)}"
         )
+    for part, arguments in (("empty_memory", 2), ("observe", 3), ("rollout", 4)):
+        if not takes(getattr(given, part), *range(arguments)):
+            wanted = _ARGUMENTS[part]
+            raise UserError(
+                f"{part} of a forecaster must take ({wanted}), which that of {type(given).__name__} does not"
+            )
     if not isinstance(given.spec, SceneSpec):
         raise UserError(f"the spec of a forecaster must be a SceneSpec, got {type(given.spec).__name__}")
     for part, least in (("horizon_steps", 1), ("num_edge_types", 1), ("edge_feature_dim", 0)):
         number = getattr(given, part)
         if not isinstance(number, int | np.integer) or number < least:
-            raise UserError(f"{part} of a forecaster must be a whole number from {least} on, got {short(number)}")
+            raise UserError(f"{part} of a forecaster must be a whole number from {least} on, got {short(repr(number))}")
     forecaster: Forecaster = given
     return forecaster
 

@@ -30,6 +30,14 @@ def test_every_export_is_what_its_module_defines(package: str):
         assert value.__name__ == name if hasattr(value, "__name__") else value is not None
 
 
+@pytest.mark.parametrize("name", ["envs.VecForecast", "agents.ForecastAttention", "dgvae_rl.load_policy"])
+def test_a_missing_package_is_told_with_its_extra(name: str):
+    package, _, export = name.partition(".")
+    found = run_without(("stable_baselines3",), f"from {package} import {export}")
+    sentence = f"'{export}' needs the package 'stable_baselines3', which is not installed; pip install 'dgvae-rl[rl]'"
+    assert f"ModuleNotFoundError: {sentence}" in found.stderr
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_type_checkers_see_the_exports(package: str):
     tree = ast.parse((ROOT / package / "__init__.py").read_text())

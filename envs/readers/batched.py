@@ -157,7 +157,7 @@ def _as_scenes(given: AgentTensors, envs: int) -> SceneBatch:
     if states.ndim != 3 or len(states) != envs:
         raise UserError(f"TensorReader needs states of {envs} environments × agents × features, got {states.shape}")
     shape = states.shape[:2]
-    valid = np.ones(shape, dtype=np.bool_) if given.valid is None else _as_numpy(given.valid).astype(np.bool_)
+    valid = np.ones(shape, dtype=np.bool_) if given.valid is None else _as_numpy(given.valid)
     ids = np.broadcast_to(np.arange(shape[1]), shape) if given.ids is None else _as_numpy(given.ids)
     heading_rad = np.zeros(envs) if given.heading_rad is None else _as_numpy(given.heading_rad)
     for name, array, wanted in (("valid", valid, shape), ("ids", ids, shape), ("heading_rad", heading_rad, shape[:1])):
@@ -170,6 +170,9 @@ def _as_scenes(given: AgentTensors, envs: int) -> SceneBatch:
             raise UserError(f"TensorReader needs {name} that are numbers, got {array.dtype}")
     if ids.dtype.kind not in "iu":
         raise UserError(f"TensorReader needs ids that are whole numbers, got {ids.dtype}")
+    if valid.dtype.kind != "b" and not np.isin(valid, (0, 1)).all():
+        raise UserError(f"TensorReader needs valid of True and False (or 1 and 0), got {valid.dtype} with other values")
+    valid = valid.astype(np.bool_)
     states = np.where(valid[..., None], states, 0.0).astype(np.float64, copy=False)
     ids = np.where(valid, ids, PADDING_ID).astype(np.int64, copy=False)
     heading_rad = np.array(heading_rad, dtype=np.float64)  # the simulator may write into its own

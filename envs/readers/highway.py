@@ -75,11 +75,18 @@ class HighwayReader(Reader):
         """Returns what the ego perceives, padded to `max_agents`.
 
         Raises:
-            UserError: since the scene before, neither a time step has passed nor none.
+            UserError: since the scene before, neither a time step has passed nor none, or a new episode began.
         """
         now_s = float(env.unwrapped.time)  # type: ignore[attr-defined]
         passed_s = now_s - (now_s if self._read_at_s is None else self._read_at_s)
-        if min(abs(passed_s), abs(passed_s - self._spec.dt_s)) > 1e-6 * max(1.0, now_s):
+        # what highway-env's clock counts for a step, also where it simulates less (`policy_step_s`)
+        step_s = 1.0 / env.unwrapped.config["policy_frequency"]  # type: ignore[attr-defined]
+        if passed_s < -1e-6:
+            raise UserError(
+                "an episode began that the wrapper with the reader did not see, so that the history of one would leak "
+                "into the next; call its reset(), and put a wrapper that resets by itself around it, not inside"
+            )
+        if min(abs(passed_s), abs(passed_s - step_s)) > 1e-6 * max(1.0, now_s):
             raise UserError(
                 f"the env was wrapped at dt_s={self._spec.dt_s:g} but {passed_s:g} s passed between two scenes; put a "
                 "wrapper that repeats steps around this one, not inside, or set policy_frequency instead"

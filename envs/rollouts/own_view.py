@@ -19,6 +19,8 @@ class OwnView(gym.Wrapper[Any, Any, Any, Any]):
         whole: latest observation with forecasts, which the driver gets.
     """
 
+    takes_out_forecasts = True
+
     def __init__(self, env: gym.Env) -> None:
         """Wraps an environment with forecasts."""
         super().__init__(env)
@@ -42,6 +44,8 @@ class OwnParallelView(BaseParallelWrapper):
     Attributes:
         whole: latest observations with forecasts, by agent, which the driver gets.
     """
+
+    takes_out_forecasts = True
 
     def __init__(self, env: Any) -> None:
         """Wraps an environment with forecasts."""

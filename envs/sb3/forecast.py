@@ -17,7 +17,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.kinds import require_kind
-from envs.observation import ForecastStream, common_value, observe_ended, open_forecaster, require_scenes, scenes_from
+from envs.observation import (
+    ForecastStream,
+    common_value,
+    observe_ended,
+    open_forecaster,
+    require_scenes,
+    require_scenes_of,
+    scenes_from,
+)
 from envs.own_observation import own_part
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
@@ -26,6 +34,9 @@ from envs.sb3.copies import with_notes, without_notes
 from envs.scene_stream import NOISE_SEED_INFO, ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch
+
+_WITH_SCENES = "make them with make_vec_env(..., wrapper_class=SceneObservation)"
+_WITH_READER = "for example with wrapper_kwargs={'reader': ...} of make_vec_env"
 
 
 class VecForecast(ForecastWrapper, VecEnvWrapper):
@@ -81,9 +92,10 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         require_kind(venv, (VecEnv, "a Stable-Baselines3 VecEnv (make_vec_env)"), "VecForecast")
-        refuse_reader(reader, "VecForecast")
-        space = require_scenes(venv.observation_space, "VecForecast")
+        refuse_reader(reader, "VecForecast", _WITH_READER)
+        space = require_scenes(venv.observation_space, "VecForecast", _WITH_SCENES)
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")
+        require_scenes_of(spec, space, "VecForecast")
         source = common_value(venv.get_attr("scene_source"), "env id")
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps

@@ -8,6 +8,12 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+EXTRA_OF = {
+    "gymnasium": "envs", "highway_env": "envs", "pettingzoo": "envs", "mpe2": "envs",
+    "stable_baselines3": "rl", "sb3_contrib": "contrib", "envpool": "envpool",
+}  # fmt: skip
+"""Extra of dgvae-rl that brings a package, of those that exported names need."""
+
 
 def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], list[str]]:
     """Creates `__getattr__` and `__all__` of a package.
@@ -18,7 +24,7 @@ def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Ca
 
     Returns:
         A function that imports the module of a name and returns the name's value, with an AttributeError for other
-        names; and the sorted names.
+        names, and a ModuleNotFoundError that names the extra where a package is missing; and the sorted names.
     """
     module_of = {name: module for module, names in modules.items() for name in names}
     above = package.rpartition(".")[0]  # "dgvae_rl" where a user's folder hides the package (dgvae_rl.own_packages)
@@ -26,6 +32,14 @@ def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Ca
     def load(name: str) -> Any:
         if name not in module_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(importlib.import_module(f"{above}.{module_of[name]}".lstrip(".")), name)
+        try:
+            return getattr(importlib.import_module(f"{above}.{module_of[name]}".lstrip(".")), name)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing not in EXTRA_OF:
+                raise
+            install = f"pip install 'dgvae-rl[{EXTRA_OF[missing]}]'"
+            sentence = f"'{name}' needs the package '{missing}', which is not installed; {install}"
+            raise ModuleNotFoundError(sentence, name=error.name) from error
 
     return load, sorted(module_of)

@@ -1,11 +1,12 @@
 """What each wrapper says to an environment of another wrapper's kind, and to one that begins episodes by itself."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
 import pytest
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -24,6 +25,12 @@ READER = FunctionReader(read_crowd, SPEC)
 
 def scenes() -> SceneObservation:
     return SceneObservation(DictCrowd())
+
+
+class Pool(gym.Env, gym.vector.VectorEnv):
+    """An environment of both classes, as EnvPool's are."""
+
+    num_envs = 1
 
 
 def with_forecasts() -> ForecastObservation:
@@ -47,6 +54,8 @@ WRONG: dict[str, tuple[Any, Callable[[], Any], str]] = {
     "vector in SB3": (VecForecast, lambda: SyncVectorEnv([scenes]), r"VecEnv \(make_vec_env\), .*; use VectorForecast"),
     "single in SB3": (VecForecast, scenes, "the single environment SceneObservation; use ForecastObservation"),
     "single in PettingZoo": (ForecastParallelEnv, Crowd, "a PettingZoo parallel env, .*Crowd; use ForecastObservation"),
+    "EnvPool": (ForecastObservation, lambda: Pool(), r"got Pool, a pool of EnvPool's; make it with gym.make"),
+    "EnvPool in vector": (VectorForecast, lambda: Pool(), "got Pool, a pool of EnvPool's; make it with gym.make"),
     "PettingZoo's class": (ForecastParallelEnv, lambda: Swarm, r"got the class Swarm; make an environment of it"),
 }  # fmt: skip
 
@@ -79,3 +88,24 @@ def test_autoreset_around_begins_with_an_empty_history():
     opened, *_ = env.step(env.action_space.sample())
     assert isinstance(env.unwrapped, gym.Env) and env.unwrapped.time == 0
     assert opened["forecast"].shape == first["forecast"].shape
+
+
+def test_vector_wrappers_say_in_gymnasiums_words_how_to_make_scenes():
+    plain, shown = SyncVectorEnv([DictCrowd]), SyncVectorEnv([with_forecasts])
+    with pytest.raises(UserError, match=r"make them with gym.make_vec\(id, num_envs, wrappers=\[SceneObservation\]\)"):
+        VectorForecast(plain, "constant-velocity")
+    with pytest.raises(UserError, match=r"got Box observations without them; make them with gym.make_vec"):
+        VectorForecast(shown, "constant-velocity")
+    with pytest.raises(UserError, match=r"with wrappers=\[functools.partial\(SceneObservation, reader=...\)\] of gym"):
+        VectorForecast(SyncVectorEnv([scenes]), "constant-velocity", reader=READER)
+    with pytest.raises(UserError, match=r"make them with make_vec_env\(..., wrapper_class=SceneObservation\)"):
+        VecForecast(DummyVecEnv([DictCrowd]), "constant-velocity")
+
+
+def test_environments_in_other_processes_cannot_be_copied_and_go_on():
+    env = VectorForecast(AsyncVectorEnv([scenes, scenes]), "constant-velocity")
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=r"in processes of their own .AsyncVectorEnv. cannot be copied; use SyncV"):
+        deepcopy(env)
+    env.step(env.action_space.sample())
+    env.close()

@@ -10,7 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries, into_ego_axes, others_by_distance, path_entries
+from envs.entries import (
+    FORECAST_KEYS,
+    PATH_KEYS,
+    ego_entries,
+    entry_spaces,
+    into_ego_axes,
+    others_by_distance,
+    path_entries,
+)
 from envs.observation import (
     SCENE_KEYS,
     ForecastConfig,
@@ -18,6 +26,7 @@ from envs.observation import (
     carries_scenes,
     open_forecaster,
     require_scenes,
+    require_scenes_of,
     scene_entries,
     scene_spaces,
     scenes_from,
@@ -367,12 +376,22 @@ def test_scenes_survive_the_way_through_an_observation():
 def test_spaces_without_scenes_are_named():
     whole = gym.spaces.Dict({"observation": gym.spaces.Discrete(2), **scene_spaces(HIGHWAY_SPEC)})
     assert carries_scenes(whole)
-    assert require_scenes(whole, "Wrapper") is whole
+    assert require_scenes(whole, "Wrapper", "make them so") is whole
     partial = gym.spaces.Dict({key: whole[key] for key in SCENE_KEYS[:-1]})
     for space, name in ((partial, "Dict"), (gym.spaces.Box(0, 1, (3,)), "Box")):
         assert not carries_scenes(space)
         with pytest.raises(UserError, match=f"Wrapper needs environments that report scenes, got {name} .*SceneObserv"):
-            require_scenes(space, "Wrapper")
+            require_scenes(space, "Wrapper", "make them so")
+    shown = gym.spaces.Dict({**entry_spaces(ConstantVelocity(HIGHWAY_SPEC), HIGHWAY_SPEC, ForecastConfig())})
+    with pytest.raises(UserError, match="Wrapper makes the forecasts of all .* SceneObservation in the place of"):
+        require_scenes(shown, "Wrapper", "make them so")
+
+
+def test_scenes_of_another_shape_are_named():
+    require_scenes_of(HIGHWAY_SPEC, gym.spaces.Dict(scene_spaces(HIGHWAY_SPEC)), "Wrapper")
+    stacked = {key: gym.spaces.Box(-9, 9, (2, *space.shape)) for key, space in scene_spaces(HIGHWAY_SPEC).items()}
+    with pytest.raises(UserError, match=r"^Wrapper: a wrapper around SceneObservation changed 'scene_states' from"):
+        require_scenes_of(HIGHWAY_SPEC, gym.spaces.Dict(stacked), "Wrapper")
 
 
 # --- Which forecaster -------------------------------------------------------------------------------------------------

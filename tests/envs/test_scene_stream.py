@@ -243,6 +243,21 @@ def test_without_an_ego_no_agent_is_taken_for_it():
         ForecastStream(forecaster, layout, ENVS, ForecastConfig())
 
 
+def test_a_forecaster_of_another_time_step_is_refused():
+    """Its forecast would be of other times than the ego's path."""
+    with pytest.raises(UserError, match="forecaster was trained at dt_s=1 but the stream of scenes steps at dt_s=0.1"):
+        ForecastStream(tiny_model(HIGHWAY_SPEC), replace(HIGHWAY_SPEC, dt_s=0.1), ENVS, ForecastConfig())
+
+
+def test_samples_of_all_agents_and_environments_must_fit_into_memory(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("predictor.support.memory.memory_bytes", lambda: 10**6)
+    needed = 8 * HIGHWAY_SPEC.max_agents * tiny_model(HIGHWAY_SPEC).horizon_steps
+    fits = 10**6 // needed
+    ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, 1, ForecastConfig(num_samples=fits))
+    with pytest.raises(UserError, match="pass a smaller --num-samples"):
+        ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, 2, ForecastConfig(num_samples=fits))
+
+
 def test_over_a_boundary_plans_are_those_of_the_new_episode():
     config = ForecastConfig(num_plans=2)
     made = ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, ENVS, config)

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries
 from envs.observation import SCENE_KEYS
+from envs.readers import FunctionReader
 from envs.readers.base import Reader
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
 from envs.wrappers import ForecastObservation, SceneObservation
@@ -372,8 +374,57 @@ def test_id_without_a_checkpoint_is_named():
 def test_several_controlled_vehicles_are_named():
     env = make_env("intersection-multi-agent-v2")
     for wrapper, arguments in ((SceneObservation, ()), (ForecastObservation, ("constant-velocity",))):
-        with pytest.raises(UserError, match="must be one array or a Dict of arrays, got Tuple; .*FlattenObservation"):
+        with pytest.raises(UserError, match="with several egos; highway-env's intersection for several is HighwayP"):
             wrapper(env, *arguments)
+
+
+def test_forecasts_are_added_once(highway_checkpoint: str):
+    shown = ForecastObservation(short_env(10), highway_checkpoint, flatten=True)
+    with pytest.raises(UserError, match="ForecastObservation would add forecasts to those of ForecastObservation in"):
+        ForecastObservation(shown, highway_checkpoint, flatten=True)
+    hidden = FlattenObservation(SceneObservation(short_env(10)))
+    with pytest.raises(UserError, match="a wrapper around SceneObservation hides its scenes from ForecastObservation"):
+        ForecastObservation(hidden, highway_checkpoint)
+
+
+def test_steps_after_an_end_are_warned_of_once(highway_checkpoint: str):
+    env = ForecastObservation(short_env(1), highway_checkpoint)
+    env.reset(seed=0)
+    assert env.step(1)[3]
+    with pytest.warns(UserWarning, match="step.. of env '.*' was called after an episode's end, without reset"):
+        env.step(1)
+    env.step(1)
+    env.reset(seed=0)
+    env.step(1)
+
+
+class Old(gym.Env):
+    """An environment as Gym had them before version 0.26."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+    new_reset = False
+
+    def reset(self, **_: Any) -> Any:
+        zeros = np.zeros(2, dtype=np.float32)
+        return (zeros, {}) if self.new_reset else zeros
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(2, dtype=np.float32), 0.0, False, {}
+
+
+def test_environments_of_older_versions_are_told_what_to_return():
+    def read(env: gym.Env) -> Scene:
+        return Scene(np.zeros((1, 4)), np.arange(1), np.ones(1, dtype=np.bool_))
+
+    old = Old()
+    env = SceneObservation(old, reader=FunctionReader(read, SceneSpec(dt_s=1.0)))
+    with pytest.raises(UserError, match="reset of env 'Old' must return .observation, info., got ndarray"):
+        env.reset()
+    old.new_reset = True
+    env.reset()
+    with pytest.raises(UserError, match="step of env 'Old' must return .*truncated, info., got 4 values"):
+        env.step(0)
 
 
 @pytest.mark.parametrize("field", ["num_samples", "horizon_steps"])

@@ -93,6 +93,7 @@ def put(place: Any, value: Any) -> Callable[[torch.Tensor], torch.Tensor]:
         (dict(ids=put((0, 0), -3)), r"ids of present agents must not be negative.*entry 0"),
         (dict(ids=lambda i: torch.ones_like(i)), r"ids must be unique within an environment.* 3 of 3"),
         (dict(ids=lambda i: i.double()), r"ids that are whole numbers, got float64"),
+        (dict(valid=lambda v: v * 0.5), r"valid of True and False .or 1 and 0., got float32 with other values"),
         (dict(valid=lambda v: v[:, :2]), r"valid of the shape \(3, 6\).* got \(3, 2\)"),
         (dict(states=lambda s: s[:2]), r"states of 3 environments × agents × features, got \(2, 6, 4\)"),
     ],
@@ -102,6 +103,12 @@ def test_a_bad_array_is_refused_in_a_line(changes: dict[str, Any], words: str):
     with pytest.raises(UserError, match=words) as refused:
         TensorReader(ROAD).read(given, np.arange(3))
     assert "\n" not in str(refused.value)
+
+
+def test_ones_and_zeros_are_truth_values():
+    given = changed(valid=lambda v: v.to(torch.int8))
+    expected = TensorReader(ROAD).read(changed(), np.arange(3)).valid
+    assert TensorReader(ROAD).read(given, np.arange(3)).valid.tolist() == expected.tolist()
 
 
 def test_equal_ids_of_absent_agents_are_no_matter():

@@ -96,7 +96,11 @@ def test_every_registered_id_reads(env_id: str):
 
 @pytest.mark.parametrize("policy_hz", [1, 2, 5, 15])
 def test_time_step_is_what_the_simulator_simulates(policy_hz: int):
-    """15 Hz is no multiple of 2 Hz: highway-env then simulates 7 of 7.5 frames."""
+    """15 Hz is no multiple of 2 Hz: highway-env then simulates 7 of 7.5 frames, and its clock counts 7.5."""
+    wrapped = ForecastObservation(make_env("merge-v1", config={"policy_frequency": policy_hz}), "constant-velocity")
+    wrapped.reset(seed=0)
+    for _ in range(3):
+        wrapped.step(1)
     env = make_env("merge-v1", config={"policy_frequency": policy_hz})
     env.reset(seed=0)
     start_m = float(env.unwrapped.vehicle.position[0])
@@ -104,6 +108,16 @@ def test_time_step_is_what_the_simulator_simulates(policy_hz: int):
     env.step(idle_action(env))
     travelled_m = float(env.unwrapped.vehicle.position[0]) - start_m
     assert reader_for(env).spec.dt_s == pytest.approx(travelled_m / speed_mps, rel=1e-3)
+
+
+def test_an_episode_that_begins_unseen_is_refused():
+    env = ForecastObservation(make_env("highway-fast-v0"), "constant-velocity")
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(1)
+    env.unwrapped.reset(seed=1)
+    with pytest.raises(UserError, match="an episode began that the wrapper with the reader did not see"):
+        env.step(1)
 
 
 def test_a_wrapper_inside_that_repeats_steps_is_refused():
