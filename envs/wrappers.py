@@ -96,6 +96,11 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._over = self._warned = False
         self.observation_space = gym.spaces.Dict({**own, **scene_spaces(self.reader.spec)})
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a copy or a pickle; a copy may look ahead past the end, so it warns of nothing."""
+        super().__setstate__(state)
+        self._warned = True
+
     @property
     def scene_spec(self) -> SceneSpec:
         """Layout of the scenes."""

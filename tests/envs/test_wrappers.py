@@ -1,3 +1,4 @@
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -391,6 +392,7 @@ def test_steps_after_an_end_are_warned_of_once(highway_checkpoint: str):
     env = ForecastObservation(short_env(1), highway_checkpoint)
     env.reset(seed=0)
     assert env.step(1)[3]
+    deepcopy(env).step(1)  # a copy looks ahead
     with pytest.warns(UserWarning, match="step.. of env '.*' was called after an episode's end, without reset"):
         env.step(1)
     env.step(1)

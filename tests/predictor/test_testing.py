@@ -395,3 +395,18 @@ def test_a_forecaster_needs_all_parts():
         setattr(wrong, part, number)
         with pytest.raises(UserError, match=f"{part} of a forecaster must be a whole number from {least} on, got"):
             require_forecaster(wrong)
+    text = Smooth()
+    text.horizon_steps = "5"  # type: ignore[assignment]
+    with pytest.raises(UserError, match="horizon_steps of a forecaster must be a whole number from 1 on, got '5'"):
+        require_forecaster(text)
+
+
+def test_methods_take_what_they_are_called_with():
+    class WithoutNoise(Smooth):
+        def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1) -> Futures:  # type: ignore[override]
+            return super().rollout(belief, horizon_steps, num_samples)
+
+    with pytest.raises(
+        UserError, match="rollout of a forecaster must take .belief, .*generator., which that of Withou"
+    ):
+        require_forecaster(WithoutNoise())

@@ -8,7 +8,7 @@ from highway_env.vehicle.objects import Obstacle
 
 from envs.plans import plan_model_for
 from envs.rollouts import plan_moments
-from envs.rollouts.branches import BranchPoint
+from envs.rollouts.branches import BranchPoint, copied
 from envs.rollouts.plan_moments import EVERY, FIRST_STEP, STRAIGHT, PlanTask, moment, play_plans
 from envs.rollouts.side_forecasts import SideForecaster
 from envs.rollouts.world import EgoWorld, open_world
@@ -131,7 +131,7 @@ def test_the_true_plan_is_what_the_ego_does_in_the_plain_branch(monkeypatch: pyt
     moment(world, model, observed(world), 0, 0, HORIZON)
     (plans,) = given
     assert plans.shape == (1 + len(model.names), HORIZON, 4)
-    np.testing.assert_array_equal(plans[0], [scene.states[0] for scene in played(world, HORIZON)])
+    np.testing.assert_array_equal(plans[0], [scene.states[0] for scene in played(copied(world), HORIZON)])
 
 
 def plan_task(env_id: str, driver: str, seed: int, max_steps: int, horizon_steps: int) -> PlanTask:

@@ -29,7 +29,8 @@ def motion(env: gym.Env) -> np.ndarray:
     env.reset(seed=5)
     places = []
     for _ in range(8):
-        env.step(1)
+        if env.step(1)[2]:
+            break
         places.append([vehicle.position.copy() for vehicle in env.unwrapped.road.vehicles])  # type: ignore[attr-defined]
     env.close()
     return np.array(places)

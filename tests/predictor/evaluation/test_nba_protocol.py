@@ -75,6 +75,15 @@ def errors(forecaster: Forecaster, windows: Windows, num_samples: int = 1, batch
     return tally.errors("it")
 
 
+def test_without_a_player_nothing_is_perfect(tmp_path: Path):
+    windows, _ = walks(tmp_path, (25,))
+    tally = PlayerTally(1)
+    for possession_of, outcome in player_outcomes(ConstantVelocity(windows.spec), windows, np.arange(2), 1):
+        tally.add(possession_of, replace(outcome, valid=torch.zeros_like(outcome.valid)))
+    found = tally.errors("it")
+    assert found.forecasts == 0 and np.isnan([found.min_ade_ft, found.fde_ft, found.energy_ft]).all()
+
+
 class Offset(ConstantVelocity):
     """Constant velocity plus a given offset of each sample, agent and step [ft] along x."""
 

@@ -118,6 +118,14 @@ def windows(history_steps: int = 4, horizon_steps: int = 3, **kwargs: int) -> Wi
     return Windows([episode, short], spec(ROAD), history_steps, horizon_steps, **kwargs)
 
 
+def test_the_last_windows_may_be_all_or_none():
+    outcome = run_window_batch(ConstantVelocity(spec(ROAD)), windows().batch(np.arange(4)), 3)
+    for count, left in ((0, 0), (3, 3), (4, 4), (9, 4)):
+        last = outcome.last_windows(count)
+        assert len(last.forecast) == len(last.valid) == left
+        assert torch.equal(last.future, outcome.future[len(outcome.future) - left :])
+
+
 def test_tail_of_the_sequence_is_the_window():
     """The horizon-only view comes out of the same run: same samples, same truths, ego left out."""
     forecaster, cut = model(frame=ROAD), windows()
