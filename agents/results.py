@@ -65,7 +65,8 @@ class Evaluation:
         # a success with a crash counts as none, so it does not show that failures are reported
         succeeded = [e.success for e in played if not e.crashed]
         safe, failed = (reports_only_events(said) for said in ([e.crashed for e in played], succeeded))
-        return [summarize(policy, episodes, safe, failed) for policy, episodes in self.results.items()]
+        told = any(e.success is not None for e in played)
+        return [summarize(policy, episodes, safe, failed, told) for policy, episodes in self.results.items()]
 
     @property
     def constant_policies(self) -> str:

@@ -70,8 +70,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def percent_digits(rate: float) -> int:
-    """Returns the number of decimals of a rate in percent: one below 1 %, as one crash in 200 is not 0 %."""
-    return 1 if 0.0 < rate < 0.01 else 0
+    """Returns the number of decimals of a rate in percent: one where 0 or 100 % would hide one episode of 200."""
+    return 1 if 0.0 < rate < 0.01 or 0.99 < rate < 1.0 else 0
 
 
 def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
@@ -82,7 +82,11 @@ def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
 
 
 def summarize(
-    policy: str, episodes: Sequence[EpisodeResult], silent_is_safe: bool = False, silent_is_failure: bool = False
+    policy: str,
+    episodes: Sequence[EpisodeResult],
+    silent_is_safe: bool = False,
+    silent_is_failure: bool = False,
+    reports_success: bool = False,
 ) -> PolicySummary:
     """Computes the summary of one policy's episodes.
 
@@ -91,8 +95,11 @@ def summarize(
         episodes: its episodes.
         silent_is_safe: whether an episode without a word on crashes had none; see `reports_only_events`.
         silent_is_failure: whether an episode without a word on success had none; see there, too.
+        reports_success: whether any episode of this environment has a word on success: a policy that only crashes
+            then has none.
     """
     reports = silent_is_safe or any(e.crashed is not None for e in episodes)
+    told = any(e.success is not None for e in episodes) or (reports_success and all(e.crashed for e in episodes))
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
     length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
     roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
@@ -111,9 +118,15 @@ def summarize(
             for role in roles
         },
         {action: count / max(1, actions.total()) for action, count in actions.most_common()},
-        *_rate([bool(e.success) if silent_is_failure else e.success for e in episodes]),
+        *_rate([_success(e, told, silent_is_failure) for e in episodes]),
         _mean_driving([e.driving for e in episodes if e.driving is not None]),
     )
+
+
+def _success(episode: EpisodeResult, told: bool, silent_is_failure: bool) -> bool | None:
+    """Returns whether an episode was a success; one with a crash was none, if the policy's episodes tell of success."""
+    crashed_silently = told and episode.success is None and bool(episode.crashed)
+    return bool(episode.success) if silent_is_failure or crashed_silently else episode.success
 
 
 def reports_only_events(reported: Iterable[bool | None]) -> bool:

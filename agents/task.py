@@ -217,10 +217,11 @@ class Task:
         Raises:
             UserError: see `scene_spec`.
         """
-        options = self.options
-        sized = None if self.is_multiagent else self._sized
+        options, sized = self.options, self._sized
         if sized is not None:  # constant velocity has no range of its own
-            options |= {"perception_m": sized.spec.perception_m, "max_agents": sized.spec.max_agents}
+            options["perception_m"] = sized.spec.perception_m
+            if not self.is_multiagent:  # there a view has as many agents as the reader's scenes
+                options["max_agents"] = sized.spec.max_agents
         if self.perception_m is not None:
             options["perception_m"] = self.perception_m
         return ForecastParallelEnv(env, **options) if self.is_multiagent else ForecastObservation(env, **options)
@@ -264,10 +265,10 @@ class Task:
         return PolicyNote(pin, self.learners, self.driver, self.env_id, self.env_kwargs)
 
     def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
-        """Returns an observation space with forecasts, and the layout of the scenes behind them."""
+        """Returns an observation space with forecasts, and the layout of the scenes that a policy sees in them."""
         with closing(self.wrapped(self.make())) as env:
             if self.is_multiagent:
-                return env.observation_space(env.possible_agents[0]), env.scene_spec
+                return env.observation_space(env.possible_agents[0]), env.stream.view_spec
             return env.observation_space, env.get_wrapper_attr("scene_spec")
 
     def check(self) -> tuple[gym.Space, gym.Space]:

@@ -204,15 +204,15 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
 
 
 def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgorithm:
-    logs = str(run_dir / "tb")
-    checkpoint = run_dir / CHECKPOINT_FILE
-    if not checkpoint.exists():
+    logs, checkpoint = str(run_dir / "tb"), run_dir / CHECKPOINT_FILE
+    if checkpoint.exists():
+        ended = (run_dir / POLICY_FILE).exists()
+        anew = f"remove it to train anew; copy {BEST_FILE} first, if it is there: the best policy so far"
+        check_whole(checkpoint, f"remove it: the training has ended, with {POLICY_FILE}" if ended else anew)
+        model = load_model(checkpoint, plan.algorithm, venv, plan.device)
+        model.tensorboard_log = logs  # the folder may have moved
+    else:
         model = make_model(plan, venv, logs)
-        _seed_from_steps(plan, model)
-        return model
-    check_whole(checkpoint, f"remove it to train anew; copy {BEST_FILE} first, if it is there: the best policy so far")
-    model = load_model(checkpoint, plan.algorithm, venv, plan.device)
-    model.tensorboard_log = logs  # the folder may have moved
     _seed_from_steps(plan, model)
     return model
 

@@ -254,11 +254,19 @@ def check_ends(steps: int, source: str) -> None:
         )
 
 
+def _scenes_inside(env: gym.Env) -> SceneObservation | None:
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, SceneObservation):
+            return env
+        env = env.env
+    return None
+
+
 class SeededEpisodes(gym.Wrapper):
     """Plays queued seeds one after another and puts an `EpisodeResult` into the last info of each episode.
 
-    Episodes beyond the queue are unseeded and have no result. The seed is also that of the noise of sampled forecasts,
-    so that results depend neither on the number of environments nor on the episodes before. A driver of
+    Episodes beyond the queue repeat the last seed and have no result. The seed is also that of the noise of sampled
+    forecasts, so that results depend neither on the number of environments nor on the episodes before. A driver of
     `envs.drivers.ego` can replace the received actions; it has its own generator per seed, too.
 
     Args:
@@ -273,7 +281,9 @@ class SeededEpisodes(gym.Wrapper):
         self._keys = outcome_keys(env, crash_key, success_key)
         self._action_names = {number: name for name, number in constant_actions(env).items()}
         self._recorder = recorder_for(env)
+        self._scenes = _scenes_inside(env)
         self._seeds: list[int] = []
+        self._last: int | None = None
         self._driver_name: str | None = None
         self._driver: EgoDriver | None = None
         self._seed: int | None = None
@@ -285,10 +295,13 @@ class SeededEpisodes(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts the next queued episode."""
         self._seed = self._seeds.pop(0) if self._seeds else None
-        obs, info = self.env.reset(seed=seed if self._seed is None else self._seed, options=options)
+        self._last = self._last if self._seed is None else self._seed
+        if self._scenes is not None:  # a driver by name sees none
+            self._scenes.plans_paused = self._driver_name is not None
+        obs, info = self.env.reset(seed=seed if self._last is None else self._last, options=options)
         self._driver = None
         if self._driver_name is not None:
-            self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._seed))
+            self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._last))
         self._rewards: list[float] = []
         self._speeds_mps: list[float] = []
         self._actions: Counter[str] = Counter()

@@ -12,7 +12,7 @@ from agents.task import EVALUATION_SEED, NO_CHECKPOINT, Task
 from agents.vec_envs import EpisodeResult, MakeCopy
 from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
-from envs.readers.highway import is_highway_env
+from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import entry_for
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
@@ -133,7 +133,7 @@ def recorded(
     env = shown.wrapped(_with_pictures(task))
     act, samples = _act(task, model), _num_drawn(env.forecaster)
     try:
-        if drawn:
+        if drawn or not isinstance(env.get_wrapper_attr("reader"), HighwayReader):
             return record_pictures(
                 FilmForecasts(env, num_samples=samples, crash_key=task.crash_key), act, seed=seed, max_steps=max_steps
             )

@@ -68,6 +68,10 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         max_agents: size of a scene, the ego included; None takes the reader's default.
         reader: function or class that makes a reader for the env; None picks one by env family.
 
+    Attributes:
+        reader: reader of the scenes.
+        plans_paused: whether infos have no plans for now, although `propose_plans` asked for some.
+
     Raises:
         UserError: not one gymnasium environment, or one with Autoreset inside; no reader knows the env; or its
             observation is a Tuple, a Dict of Dicts, or has an entry of an added one's name.
@@ -93,7 +97,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
         self._played: int | None = 0
-        self._over = self._warned = False
+        self.plans_paused = self._over = self._warned = False
         self.observation_space = gym.spaces.Dict({**own, **scene_spaces(self.reader.spec)})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -177,7 +181,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         return self._observe(obs), reward, bool(terminated), bool(truncated), self._with_plans(info)
 
     def _with_plans(self, info: dict[str, Any]) -> dict[str, Any]:
-        if self._plan_model is None:
+        if self._plan_model is None or self.plans_paused:
             return info
         return {**info, **plans_info(self.make_plans(self._plan_model, self._plan_steps, self._played))}
 

@@ -125,7 +125,7 @@ def parallel_env_for_driver(env: Any, driver: str) -> Any:
 
     seen = ForecastParallelEnv(env, **options)
     space: Any = seen.observation_space(seen.possible_agents[0])
-    require_forecaster(driver, options["checkpoint"], space, seen.scene_spec, options["arm"])
+    require_forecaster(driver, options["checkpoint"], space, seen.stream.view_spec, options["arm"])
     return seen
 
 

@@ -352,6 +352,7 @@ class MultiagentRecorder:
         self.recording = kind(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up, expected_roles=roles)
         self._names: dict[int, str] = {}
         self._returns: dict[str, float] = {}
+        self._acting: list[str] = []
 
     def begin(self) -> None:
         """Records the first step, after the reset."""
@@ -363,9 +364,10 @@ class MultiagentRecorder:
     def note(self, rewards: dict[str, float]) -> None:
         """Records a step, with the rewards that led to it."""
         scene = self._env.scene
-        self._returns.update({agent: 0.0 for agent in self._env.agents if agent not in self._returns})
-        for agent, reward in rewards.items():
-            self._returns[agent] = self._returns.get(agent, 0.0) + float(reward)
+        for agent in self._acting:  # some environments go on rewarding agents that have ended
+            self._returns[agent] += float(rewards.get(agent, 0.0))
+        self._acting = list(self._env.agents)
+        self._returns.update({agent: 0.0 for agent in self._acting if agent not in self._returns})
         for name, index in scene.index_of.items():
             self._names[int(scene.scene.ids[index])] = name
         focus = scene.index_of.get(self.recording.focus)

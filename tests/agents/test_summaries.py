@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from agents.results import Evaluation
-from agents.summaries import mean_and_standard_error, summarize, wilson_interval
+from agents.summaries import mean_and_standard_error, percent_digits, summarize, wilson_interval
 from agents.vec_envs import EpisodeResult
 from envs.rollouts.driving_measures import DrivingMeasures
 from tests.agents.helpers import EPISODES
@@ -60,13 +60,28 @@ def test_success_is_a_rate_over_the_episodes_that_report_it():
     assert line.crash_rate == pytest.approx(1 / 3)
 
 
+def test_a_crash_is_no_success_where_success_is_reported():
+    safe, crashed = (replace(EPISODES[0], crashed=hit) for hit in (False, True))
+    reported = [replace(safe, success=True), replace(safe, success=False), crashed, crashed]
+    assert summarize("ppo", reported).success_rate == 0.25
+    assert summarize("ppo", [safe, crashed]).success_rate is None
+
+
+@pytest.mark.parametrize(("rate", "digits"), [(0.0, 0), (0.005, 1), (0.05, 0), (0.95, 0), (0.995, 1), (1.0, 0)])
+def test_one_episode_of_200_is_seen_in_percent(rate: float, digits: int):
+    assert percent_digits(rate) == digits
+
+
 def test_success_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():
     reached, silent = replace(EPISODES[0], success=True), replace(EPISODES[1], success=None)
     evaluation = Evaluation("toy-v0", 10, {"good": [reached, silent], "lost": [silent, silent]})
     assert [line.success_rate for line in evaluation.summaries] == [0.5, 0.0]
     assert Evaluation("toy-v0", 10, {"lost": [silent]}).summaries[0].success_rate is None
     told = replace(EPISODES[0], success=False)
-    assert Evaluation("toy-v0", 10, {"good": [reached, told, silent]}).summaries[0].success_rate == 0.5
+    unknown, crashed = (replace(silent, crashed=hit) for hit in (False, True))
+    assert Evaluation("toy-v0", 10, {"good": [reached, told, unknown]}).summaries[0].success_rate == 0.5
+    found = Evaluation("toy-v0", 10, {"good": [reached, told], "lost": [crashed], "vague": [unknown]}).summaries
+    assert [line.success_rate for line in found] == [0.5, 0.0, None]
 
 
 def test_measures_of_driving_are_means_over_the_episodes_that_have_them():

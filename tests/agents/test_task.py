@@ -1,7 +1,9 @@
 import json
 import math
+import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -16,8 +18,9 @@ from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
 from envs import ForecastObservation, make_env
 from envs.arms import ARMS
-from envs.drivers.trained import env_for_driver
+from envs.drivers.trained import env_for_driver, parallel_env_for_driver
 from envs.registry import make_multiagent_env
+from predictor.checkpoint import resolve
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY
 from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
@@ -324,3 +327,37 @@ def test_the_check_finds_own_entries_that_have_the_name_of_added_ones(env_id: st
     monkeypatch.setattr(env, "observation_space", of_agents)
     with pytest.raises(UserError, match="has an entry 'agents', as forecasts have; if it is wrapped"):
         task.check()
+
+
+# --- How far agents see -----------------------------------------------------------------------------------------------
+
+
+def near_sighted(tmp_path: Path) -> str:
+    """A copy of `simple-tag` that was trained with a range of 0.5 m."""
+    folder = tmp_path / "near"
+    shutil.copytree(resolve("simple-tag"), folder)
+    config = folder / "config.json"
+    config.write_text(config.read_text().replace('"perception_m": 1000.0', '"perception_m": 0.5'))
+    return str(folder)
+
+
+def seen_by(task: Task) -> dict[str, list[float]]:
+    with closing(task.wrapped(task.make())) as env:
+        return {agent: seen["valid"].tolist() for agent, seen in env.reset(seed=3)[0].items()}
+
+
+def test_a_pettingzoo_policy_sees_as_far_where_it_drives_as_in_training(tmp_path: Path):
+    task = Task("simple_tag_v3", "forecast", checkpoint=near_sighted(tmp_path))
+    assert task.note.forecaster is not None and task.note.forecaster.perception_m == 0.5
+    model = make_model(TrainingPlan(task, "ppo", 200, 1, 0), make_venv(task, 1), None)
+    save_model(model, tmp_path / "policy.zip", note=task.note)
+    env = parallel_env_for_driver(make_multiagent_env("simple_tag_v3"), str(tmp_path / "policy.zip"))
+    seen = {agent: each["valid"].tolist() for agent, each in env.reset(seed=3)[0].items()}
+    assert seen == seen_by(task) and seen != seen_by(Task("simple_tag_v3", "forecast"))
+
+
+def test_pettingzoo_arms_of_one_size_see_the_same_agents(tmp_path: Path):
+    near = near_sighted(tmp_path)
+    expected = seen_by(Task("simple_tag_v3", "forecast", checkpoint=near))
+    for observe in ("zeros", "constant-velocity"):
+        assert seen_by(Task("simple_tag_v3", observe, sizes_of=near)) == expected

@@ -276,11 +276,12 @@ def test_a_damaged_checkpoint_says_what_to_do_and_loses_nothing(tmp_path: Path, 
     save_model(make_ppo(), checkpoint, to_continue=True)
     checkpoint.write_bytes(checkpoint.read_bytes()[:500])
     before = {file: file.read_bytes() for file in tmp_path.glob("*.zip")}
-    with pytest.raises(
-        UserError, match="checkpoint.zip is damaged; remove it to train anew; copy best_model.zip first"
-    ):
+    with pytest.raises(UserError, match="checkpoint.zip is damaged; remove it: the training has ended, with polic"):
         train(training, tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.glob("*.zip")} == before
+    (tmp_path / "policy.zip").unlink()
+    with pytest.raises(UserError, match="damaged; remove it to train anew; copy best_model.zip first"):
+        train(training, tmp_path)
 
 
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -17,6 +17,7 @@ from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
 from envs.sb3 import envpool as envpool_module
 from envs.seeding import driver_rng
+from envs.wrappers import SceneObservation
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
@@ -123,6 +124,31 @@ def expected(seed: int) -> EpisodeResult:
 def test_every_seed_is_played_once_for_any_number_of_environments(num_envs: int):
     seeds = range(100, 107)
     assert run_episodes(dice_venv(num_envs), always_two, seeds) == [expected(seed) for seed in seeds]
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_no_episode_is_played_without_a_seed(num_envs: int):
+    class Seeded(Dice):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            assert seed is not None
+            return super().reset(seed=seed, options=options)
+
+    venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Seeded(), "crashed")] * num_envs))
+    seeds = range(100, 107)
+    assert run_episodes(venv, always_two, seeds) == [expected(seed) for seed in seeds]
+
+
+def test_no_plans_are_made_for_a_driver_by_name(monkeypatch: pytest.MonkeyPatch):
+    made = []
+    original = SceneObservation.make_plans
+    monkeypatch.setattr(SceneObservation, "make_plans", lambda *a: made.append(1) or original(*a))
+    task = Task("highway-fast-v0", what_if=True, env_kwargs='{"config": {"duration": 2}}')
+    venv = make_venv(task, 1, seeded=True, in_process=True)
+    run_episodes(venv, "slower", [1])
+    assert not made
+    run_episodes(venv, lambda obs, starts: np.ones(len(obs["valid"]), dtype=np.int64), [1])
+    assert len(made) == 3 + 1, "the opening one, two steps, and the opening one of the repeated episode"
+    venv.close()
 
 
 def test_a_crash_flag_that_is_never_reported_is_unknown():

@@ -300,6 +300,19 @@ def test_edges_end_with_the_focus_agent():
     assert count(in_arena(recording, recording.frame_of_step(DIES)), VIOLET) == 0
 
 
+def test_rewards_of_agents_that_have_ended_do_not_count(
+    recording: MultiagentRecording, monkeypatch: pytest.MonkeyPatch
+):
+    plain = StraightEnv.step
+
+    def generous(env: StraightEnv, actions: dict[str, Any]) -> Any:
+        observations, rewards, *rest = plain(env, actions)
+        return observations, dict.fromkeys(LEARNERS, 7.0) | rewards, *rest
+
+    monkeypatch.setattr(StraightEnv, "step", generous)
+    assert record_multiagent_episode(wrapped(), act, style=PLAIN).returns == recording.returns
+
+
 def test_returns_are_means_over_each_roles_agents(recording: MultiagentRecording):
     first, second = float(STEPS), float(STEPS - JOINS)  # who joins at a step earns from the next on
     agents = -2.0 * STEPS, -4.0 * DIES
