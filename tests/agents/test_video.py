@@ -2,13 +2,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
+from highway_env.envs.highway_env import HighwayEnvFast
 from stable_baselines3 import PPO
 
 from agents.arena import MultiagentArena
 from agents.task import Task
 from agents.vec_envs import EpisodeResult
 from agents.video import _in_highway_env, _with_forecasts, film, film_extremes, record_task, recorded
+from envs import readers
+from envs.readers import FunctionReader, register_reader
+from predictor.scene import Scene, SceneSpec
 from tests.agents.helpers import TOY, Meadow, policy_for
 
 SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
@@ -105,3 +111,26 @@ def test_episodes_of_envpool_have_no_films_for_highway_env_does_not_have_them(tm
     task = Task("envpool/HighwayFast-v0", "none")
     assert film_extremes(task, policy_for(Task(TOY, "none")), played(1.0, 2.0), tmp_path) == {}
     assert not list(tmp_path.iterdir())
+
+
+class OwnHighway(HighwayEnvFast):
+    """An environment that derives from highway-env's and has a reader of its own."""
+
+
+def read_cars(env: Any) -> Scene:
+    cars = env.unwrapped.road.vehicles
+    states = np.array([[*car.position, *car.velocity] for car in cars])
+    return Scene(states, np.arange(len(cars)), np.ones(len(cars), dtype=np.bool_))
+
+
+def test_an_environment_of_highway_env_with_a_reader_of_its_own_is_filmed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(readers, "_REGISTERED", dict(readers._REGISTERED))
+    gym.register("OwnHighway-v0", entry_point=OwnHighway)
+    try:
+        register_reader(OwnHighway, FunctionReader(read_cars, SceneSpec(dt_s=1.0, frame=("ego", "world"))))
+        task = Task("OwnHighway-v0", "forecast", checkpoint="highway")
+        model = PPO("MultiInputPolicy", task.wrapped(task.make()), n_steps=4, batch_size=4)
+        shown = recorded(task, model, max_steps=2)
+    finally:
+        gym.registry.pop("OwnHighway-v0")
+    assert shown is not None and len(shown) > 2
