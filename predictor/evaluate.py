@@ -18,9 +18,10 @@ from rich.console import Console
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, name_of_folder
-from predictor.data.store import EpisodeStore, read_store
+from predictor.data.store import EpisodeStore, content_id, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
+from predictor.evaluation.displacement import miss_distance_m
 from predictor.evaluation.outcomes import run_windows, windows_per_forward
 from predictor.forecaster import Forecaster
 from predictor.own_forecasters import WatchedForecaster, is_own, make_own
@@ -29,7 +30,7 @@ from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figu
 from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
 from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, write_json, write_text
 from predictor.support.memory import check_count
@@ -54,6 +55,9 @@ class EvaluateConfig:
     """Number of observed steps that the model gets before each forecast (fewer where the episode has just begun)."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes the checkpoint's (5 for constant velocity)."""
+    miss_m: float | None = None
+    """Final displacement above which a forecast misses, and distance below which agents overlap [m]; None takes 2 m, a
+    tenth of the scale where that is below 50 m."""
     max_windows: int = 4000
     """Number of windows measured at most, drawn evenly from the store."""
     seed: int = 0
@@ -69,6 +73,7 @@ class EvaluateConfig:
         """
         check_at_least(self, 1, "num_samples", "history_steps", "horizon_steps", "max_windows")
         check_at_least(self, 0, "seed")
+        check_positive(self, "miss_m")
         check_count(self.num_samples, "num_samples")
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples", 8)
         object.__setattr__(self, "device", resolve_device(self.device))
@@ -82,6 +87,7 @@ class _Subject:
     model: Forecaster | None = None  # None: constant velocity alone
     std_m: tuple[float, ...] = ()
     name: str = ""
+    note: str = ""
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
@@ -106,8 +112,11 @@ def _load(config: EvaluateConfig) -> _Subject:
     model, info = load_checkpoint(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_recorded(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
-    name = MODEL_NAMES.get(info.model, info.model)
-    return _Subject(store, info.spec, config.horizon_steps or info.horizon_steps, model, info.std_m, name)
+    name, horizon = MODEL_NAMES.get(info.model, info.model), config.horizon_steps or info.horizon_steps
+    trained_on = info.provenance.get("stores")
+    known = isinstance(trained_on, dict) and content_id(config.data) in trained_on.values()
+    note = f"{config.data} is a store that '{config.checkpoint}' was trained with: its errors elsewhere are larger"
+    return _Subject(store, info.spec, horizon, model, info.std_m, name, note if known else "")
 
 
 def _load_own(config: EvaluateConfig) -> _Subject:
@@ -133,7 +142,9 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
     # Without training data, the spread of both baselines is fitted to the test errors, in their favour.
     size = windows_per_forward(windows, chosen, config.num_samples)
     std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon, batch_size=size))
-    straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon, batch_size=size), std_m)
+    miss_m = config.miss_m or miss_distance_m(subject.spec.feature_scales[0])
+    made = run_windows(baseline, windows, chosen, horizon, batch_size=size)
+    straight = summarise("constant velocity", made, std_m, miss_m)
     if not straight.agents:
         raise UserError(
             f"store {config.data}: in {len(chosen)} windows no agent{' but the ego' * subject.spec.has_ego} is there "
@@ -146,14 +157,14 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
             subject.model, windows, chosen, horizon, config.num_samples, config.seed, size, config.device
         )
         batches = track(made, "evaluate", total=-(-len(chosen) // size))
-        accuracies.append(summarise(subject.name, batches, subject.std_m))
+        accuracies.append(summarise(subject.name, batches, subject.std_m, miss_m))
     if config.num_samples == 1:
         accuracies.append(straight)
     else:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
         made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed, size)
         # draws hold the spread already: the density is one Gaussian around the single forecast
-        drawn = summarise("constant velocity + noise", made, std_m)
+        drawn = summarise("constant velocity + noise", made, std_m, miss_m)
         error = straight.step_errors["nll"]
         accuracies.append(replace(drawn, nll=straight.nll, step_errors=drawn.step_errors | {"nll": error}))
     if config.out is not None:
@@ -213,7 +224,10 @@ def main() -> None:
     subject = _load(config)
     accuracies = _evaluate(config, subject)
     title = f"{config.checkpoint} on {config.data}"
-    Console().print(accuracy_table(accuracies, subject.spec.dt_s, title))
+    console = Console()
+    console.print(accuracy_table(accuracies, subject.spec.dt_s, title))
+    if subject.note:
+        console.print(subject.note, markup=False)
 
 
 if __name__ == "__main__":

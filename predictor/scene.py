@@ -123,7 +123,7 @@ class SceneSpec:
         if abs(self.dt_s - other.dt_s) > 1e-6:
             raise UserError(
                 f"{name} was trained at dt_s={self.dt_s:g} but {source} steps at dt_s={other.dt_s:g}; "
-                "retrain on its data, or change the step (your reader's SceneSpec; highway-env's policy_frequency)"
+                "retrain on its data, or change the step (policy_frequency, your SceneSpec, --frame-step of tracks)"
             )
 
     def check_recorded(self, other: "SceneSpec", name: str, source: str) -> None:

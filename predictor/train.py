@@ -227,7 +227,8 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
         }
         if accuracy.mixture_nll:
             result["val_mixture_nll"] = float(np.mean(accuracy.mixture_nll))
-        told = made | {"train_config": _comparable(trainer.config), "result": result}
+        stores = {address(path): content_id(path) for path in (*trainer.config.data, *trainer.config.val_data)}
+        told = made | {"train_config": _comparable(trainer.config), "stores": stores, "result": result}
         if trainer.config.only_spread:
             _, before = load_checkpoint(trainer.config.init)
             info = replace(before, config=trainer.model.config, provenance=before.provenance | {"spread": told})
@@ -266,9 +267,12 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         if config.out.exists() and any(not p.name.startswith(".") for p in config.out.iterdir()):
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")
         return
+    curve = config.out / CURVE_FILE
+    if not any((config.out / name).exists() for name in (STATE_FILE, CURVE_FILE, BEST_OF_RUN)):
+        return  # it ended before its first validation, for example by a loss that is not finite
     if not config.resume:
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
-    if not (config.out / STATE_FILE).exists() and any(p["step"] for p in read_curve(config.out / CURVE_FILE)):
+    if not (config.out / STATE_FILE).exists() and any(p["step"] for p in read_curve(curve)):
         raise UserError(
             f"cannot resume: {config.out} has a curve but no {STATE_FILE}, so that the training would begin anew and "
             "replace what is there; choose another --out"

@@ -11,7 +11,7 @@ from envs.rollouts.episode import EDGES, MODEL, NEIGHBOURS, NOISY, RESIDUAL, STR
 from envs.rollouts.report import BEFORE_CRASH_S, EnvAccuracy
 from predictor.checkpoint import CONSTANT_VELOCITY, name_of_folder, read_info
 from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
-from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
+from predictor.evaluation.displacement import min_ade, miss_distance_m
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.standard_errors import Estimate, estimate, quotient
@@ -49,7 +49,7 @@ def summarise_episodes(
         shown_as: name of the checkpoint in tables; None takes its folder's.
         env_kwargs: arguments of the environment, as the text of a JSON object.
     """
-    miss_m = miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
+    miss_m = miss_m or miss_distance_m(spec.feature_scales[0])
     outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
     first = [outcome.single() for outcome in outcomes[MODEL]]
     learned = checkpoint != CONSTANT_VELOCITY

@@ -8,6 +8,8 @@ from predictor.data.store import Episode
 
 FASTEST_MPS = 100.0
 """Speed of an agent above which a line, or the unit, is probably wrong [m/s]."""
+SLOWEST_MPS = 0.01
+"""Speed of the fastest agent below which the unit is probably wrong [m/s]."""
 
 
 def doubts(episodes: Sequence[Episode], counts: Mapping[str, int]) -> list[str]:
@@ -30,5 +32,10 @@ def doubts(episodes: Sequence[Episode], counts: Mapping[str, int]) -> list[str]:
         found.append(
             f"agent {episode.ids[agent]} of '{episode.label}' moves at {fastest_mps.max():,.0f} m/s (episode {number}, "
             f"step {step}); check its lines, --columns, --scale and --dt-s"
+        )
+    elif fastest_mps.max(initial=0.0) < SLOWEST_MPS:
+        found.append(
+            f"nobody moves faster than {fastest_mps.max(initial=0.0):.1e} m/s; are positions degrees, or of another "
+            "unit? Project them to metres, and check --columns, --scale and --dt-s"
         )
     return found

@@ -53,6 +53,11 @@ class Windows:
         min_history_steps: int = 1,
     ) -> None:
         """Indexes the windows and computes which agents are visible."""
+        if min(history_steps, horizon_steps, min_history_steps) < 1:
+            raise UserError(
+                "windows need at least 1 step of history and 1 of horizon, got "
+                f"{min(history_steps, min_history_steps)} and {horizon_steps}"
+            )
         self.spec = spec
         self.history_steps = history_steps
         self.horizon_steps = horizon_steps

@@ -109,6 +109,11 @@ def squared_error(
     return (mean - future).square().sum(-1), valid
 
 
+def miss_distance_m(scale_m: float) -> float:
+    """Returns the final displacement above which a forecast misses [m]: 2 m, a tenth of the scale of a small arena."""
+    return MISS_THRESHOLD_M if scale_m >= 50 else 0.1 * scale_m
+
+
 LEAST_STD_M = 1e-3
 """Smallest standard deviation of a mode that counts [m]: a likelihood has no upper bound as it goes to zero."""
 

@@ -203,16 +203,19 @@ def noise_of_windows(indices: Int[np.ndarray, " some"], seed: int) -> list[np.ra
 def _observed(forecaster: Forecaster, batch: WindowBatch) -> Iterator[tuple[Int[Tensor, " batch"], Belief]]:
     """Yields the step of each window and the belief after it; all histories end together.
 
-    Windows with a shorter history get an empty scene until it begins (step below 0).
+    Windows with a shorter history get an empty scene until it begins (step below 0). The memory of an agent that is
+    absent is dropped, as in live scenes (`predictor.online`).
     """
     window = torch.arange(len(batch.states), device=batch.states.device)
     memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
+    places = torch.arange(batch.states.shape[2], device=batch.states.device).expand(len(window), -1)
     for back in range(int(batch.last_observed.max()), -1, -1):
         step = batch.last_observed - back
         now = step.clamp(min=0)
         valid = batch.valid[window, now] & (step >= 0)[:, None]
         memory, belief = forecaster.observe(memory, batch.states[window, now] * valid[..., None], valid)
         yield step, belief
+        memory = memory.reorder(places, valid)
 
 
 def _free_run(

@@ -8,7 +8,14 @@ import torch
 
 from predictor.checkpoint import read_info, resolve
 from predictor.models import ModelName
-from predictor.support.config_checks import MOST_THREADS, check_at_least, check_at_most, check_choices, check_positive
+from predictor.support.config_checks import (
+    MOST_THREADS,
+    check_at_least,
+    check_at_most,
+    check_choices,
+    check_positive,
+    check_types,
+)
 from predictor.support.errors import UserError
 from predictor.support.memory import check_memory
 from predictor.support.runtime import resolve_device
@@ -167,7 +174,13 @@ class TrainConfig:
         Raises:
             UserError: a value is out of range, the device does not exist, or the checkpoint of `init` cannot be read.
         """
+        check_types(self)
         check_choices(self)
+        for name in ("data", "val_data"):
+            given = getattr(self, name)
+            paths = (given,) if isinstance(given, str | Path) else tuple(given)
+            object.__setattr__(self, name, tuple(Path(path) for path in paths))
+        object.__setattr__(self, "out", Path(self.out))
         if self.horizon_steps == 0:
             steps = read_info(resolve(self.init)).horizon_steps if self.init else HORIZON_STEPS
             object.__setattr__(self, "horizon_steps", steps)

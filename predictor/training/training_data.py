@@ -71,19 +71,28 @@ def load_data(config: TrainConfig) -> TrainingData:
         val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
         return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part], notes)
     train, val, episodes, splits = [], [], [], []
-    for store in stores:
-        group = _kept_together(store, config.val_fraction)
+    for place, store in zip(paths, stores, strict=True):
+        group, few = _kept_together(store, config.val_fraction)
         parts = split_episodes(int(group.max()) + 1, config.val_fraction, config.seed)
         splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
-    # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
-    held = [{_played(store, i) for i in held_out} for store, (_, held_out) in zip(stores, splits, strict=True)]
-    for path, store, mine, (kept, held_out) in zip(config.data, stores, held, splits, strict=True):
-        elsewhere = set[Any]().union(*held) - mine - {None}
-        kept = [i for i in kept if _played(store, i) not in elsewhere][: config.max_episodes or None]
+        if few:
+            notes += (
+                f"{place}: {few} are too few recordings to hold out {config.val_fraction:.0%} of them, so stretches "
+                "are held out beside those that are trained on; pass a larger --val-fraction, or --val-data",
+            )
+    # stores may have seeds, or recordings, in common: what is held out in one is not trained on in another
+    marks = _marks(stores)
+    held = [set[Any]().union(*(own[i] for i in held_out)) for own, (_, held_out) in zip(marks, splits, strict=True)]
+    for number, (path, store, (kept, held_out)) in enumerate(zip(config.data, stores, splits, strict=True)):
+        elsewhere = set[Any]().union(*held[:number], *held[number + 1 :]) - held[number]
+        kept = [i for i in kept if not marks[number][i] & elsewhere][: config.max_episodes or None]
         if not kept or not held_out:
+            advice = "collect more, or change --val-fraction"
+            if "recordings" in store.info.provenance:
+                advice = "convert with a smaller --episode-steps, or pass --val-data"
             raise UserError(
                 f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
-                f"{len(held_out)} for validation; both need at least one, so collect more, or change --val-fraction"
+                f"{len(held_out)} for validation; both need at least one, so {advice}"
             )
         chosen_here = [store.episodes[i] for i in kept]
         train.append(_windows(config, chosen_here, spec, validation=False))
@@ -92,18 +101,38 @@ def load_data(config: TrainConfig) -> TrainingData:
     return TrainingData(spec, sources, train, val, episodes, notes)
 
 
-def _kept_together(store: EpisodeStore, val_fraction: float) -> Int[np.ndarray, " episodes"]:
+def _kept_together(store: EpisodeStore, val_fraction: float) -> tuple[Int[np.ndarray, " episodes"], int]:
     """Returns a number for each episode that those share which stay on one side of the split.
 
     These are the branches of an episode and, of data read from files, the stretches of one recording: the same agents
     moments later. Where there are too few recordings to hold out a share of them, stretches count on their own.
+
+    Returns:
+        The numbers, and the number of recordings where they are too few; 0 otherwise.
     """
     recordings = store.info.provenance.get("recordings")
+    few = 0
     if isinstance(recordings, list) and len(recordings) == len(store.episodes):
         names, recording = np.unique([str(name) for name in recordings], return_inverse=True)
         if split_episodes(len(names), val_fraction, 0)[1]:
-            return recording
-    return siblings(store.episodes)
+            return recording, 0
+        few = len(names)
+    return siblings(store.episodes), few
+
+
+def _marks(stores: Sequence[EpisodeStore]) -> list[list[set[Any]]]:
+    """Returns, for each episode of each store, what other stores know it by: its seed, or the scenes of a recording."""
+    many = sum("seed" not in store.info.provenance for store in stores) > 1  # else no recording can be in two
+    found = []
+    for store in stores:
+        played = [_played(store, i) for i in range(len(store.episodes))]
+        found.append(
+            [
+                {seed} if seed is not None else _scenes([episode]) if many else set()
+                for seed, episode in zip(played, store.episodes, strict=True)
+            ]
+        )
+    return found
 
 
 def _played(store: EpisodeStore, number: int) -> tuple[str, int] | None:
@@ -148,7 +177,7 @@ def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: i
                     f"seeds, such as {min(seed for _, seed in both)}; collect it with another --seed, or leave "
                     "val_data out"
                 )
-    recorded = [set() if "seed" in store.info.provenance else _scenes(store) for store in stores]
+    recorded = [set() if "seed" in store.info.provenance else _scenes(store.episodes) for store in stores]
     for path, held_out in zip(paths[cut:], recorded[cut:], strict=True):
         for trained, scenes in zip(paths[:cut], recorded[:cut], strict=True):
             if common := held_out & scenes:
@@ -158,11 +187,11 @@ def _check_held_out(paths: Sequence[str], stores: Sequence[EpisodeStore], cut: i
                 )
 
 
-def _scenes(store: EpisodeStore) -> set[int]:
+def _scenes(episodes: Sequence[Episode]) -> set[int]:
     """Returns a hash of each scene with two agents or more, by which a recording is known again."""
     return {
         hash(states[there].tobytes())
-        for episode in store.episodes
+        for episode in episodes
         for states, there in zip(episode.states, episode.valid, strict=True)
         if there.sum() > 1
     }

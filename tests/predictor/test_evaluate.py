@@ -14,12 +14,13 @@ from rich.console import Console
 
 from predictor import evaluate as evaluation
 from predictor.baselines.mlp import MLP, MLPConfig
-from predictor.checkpoint import CheckpointInfo, save_checkpoint
-from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
+from predictor.data.store import Episode, StoreInfo, content_id, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
 from predictor.evaluate import EvaluateConfig, evaluate
 from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.displacement import miss_distance_m
 from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.standard_errors import Statistic
 from predictor.reports.tables import accuracy_table, markdown_table
@@ -198,6 +199,32 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
     assert [r["name"] for r in content["rows"]] == ["constant velocity + noise"]
     assert (out / "scenes.png").exists()
+
+
+def test_the_store_of_a_training_is_named(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    model, info = load_checkpoint(save(tmp_path / "trained", data))
+    assert info.provenance["stores"]
+    run(monkeypatch, "--checkpoint", tmp_path / "trained", "--data", data, "--num-samples", 1)
+    said = f"{data} is a store that '{tmp_path / 'trained'}' was trained with: its errors elsewhere are larger"
+    assert said in " ".join(capsys.readouterr().out.split())
+
+
+def save(path: Path, store: Path) -> Path:
+    model = MLP(spec(), MLPConfig(hidden_dim=4), 2)
+    stores = {"data/circles": content_id(store)}
+    save_checkpoint(path, model, CheckpointInfo(spec(), model.config, 2, model="mlp", provenance={"stores": stores}))
+    return path
+
+
+def test_the_distance_of_misses_can_be_chosen_and_fits_the_scale(data: Path):
+    settings = EvaluateConfig("constant-velocity", data, num_samples=1, horizon_steps=2)
+    (found,) = evaluate(settings)
+    assert found.miss_threshold_m == miss_distance_m(spec().feature_scales[0])
+    (far,) = evaluate(replace(settings, miss_m=1e6))
+    assert far.miss_threshold_m == 1e6 and far.miss_rate == 0.0 < found.miss_rate
+    assert [miss_distance_m(scale) for scale in (100.0, 50.0, 6.0)] == pytest.approx([2.0, 2.0, 0.6])
 
 
 def test_a_forecaster_of_ones_own_is_measured_by_its_name(data: Path, tmp_path: Path):

@@ -113,7 +113,7 @@ def test_another_time_step_is_named_with_both_numbers():
         SceneSpec(dt_s=1.0).check_compatible(SceneSpec(dt_s=0.2), "checkpoint 'highway'", "env 'racetrack-v1'")
     assert str(error.value) == (
         "checkpoint 'highway' was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2; "
-        "retrain on its data, or change the step (your reader's SceneSpec; highway-env's policy_frequency)"
+        "retrain on its data, or change the step (policy_frequency, your SceneSpec, --frame-step of tracks)"
     )
 
 

@@ -282,6 +282,24 @@ def checkpoint_of(out: Path) -> dict[str, torch.Tensor]:
     return load_checkpoint(out / "checkpoint")[0].state_dict()
 
 
+def test_a_run_that_ended_before_its_first_validation_leaves_its_folder_free(tiny: None, circles: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    with pytest.raises(UserError, match="the loss is nan at step"):
+        train(config(circles, out, lr=1e30, clip_norm=1e30))
+    assert (out / "config.json").exists() and not (out / "curve.json").exists()
+    assert train(config(circles, out)) == out / "checkpoint"
+    with pytest.raises(UserError, match="holds a run already"):
+        train(config(circles, out))
+
+
+def test_paths_may_be_texts(tiny: None, circles: Path, tmp_path: Path):
+    given: Any = {"data": str(circles), "out": str(tmp_path / "run")}
+    assert config(circles, tmp_path / "run") == replace(config(circles, tmp_path), **given)
+    assert replace(config(circles, tmp_path), data=[circles, str(circles)]).data == (circles, circles)
+    with pytest.raises(UserError, match="steps must be a whole number, got '1'"):
+        replace(config(circles, tmp_path), steps="1")
+
+
 def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Path):
     out = tmp_path / "run"
     assert train(config(circles, out)) == out / "checkpoint"

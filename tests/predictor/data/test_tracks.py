@@ -367,6 +367,8 @@ def test_what_is_probably_wrong_is_said(source: Path, walk: Path, loader: Loader
     assert jump.startswith(
         "warning: agent 4 of 'walk' moves at 255 m/s (episode 0, step 1); check its lines, --columns"
     )
+    (slow,) = said([(f, i, 1e-5 * x, 1e-5 * y) for f, i, x, y in WALK])
+    assert slow.startswith("warning: nobody moves faster than ") and "are positions degrees, or of another" in slow
     (lost,) = said([(f, i + f * (f > 800), x, y) for f, i, x, y in WALK])
     assert lost.startswith(
         "warning: only 3 of 9 lines are in episodes (lines dropped: no velocity (first of a track or"

@@ -204,6 +204,12 @@ def test_windows_that_no_intervention_leaves_are_told_from_short_episodes():
         Windows([kicked], spec(), 1, 2, min_future_steps=2)
 
 
+@pytest.mark.parametrize(("history", "horizon", "told"), [(0, 5, "0 and 5"), (-3, 5, "-3 and 5"), (2, -1, "1 and -1")])
+def test_windows_have_steps(history: int, horizon: int, told: str):
+    with pytest.raises(UserError, match=f"windows need at least 1 step of history and 1 of horizon, got {told}"):
+        Windows([along_x([0.0, 1.0, 2.0])], spec(), history, horizon, min_history_steps=min(1, max(history, 1)))
+
+
 def test_episodes_without_agents_have_windows_without_agents():
     nobody = Episode(np.zeros((3, 0, 4), np.float32), np.zeros((3, 0), np.bool_), np.zeros(0, np.int64))
     for has_ego in (True, False):

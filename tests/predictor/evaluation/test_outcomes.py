@@ -1,4 +1,5 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from predictor.evaluation.outcomes import (
 )
 from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
-from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.online import OnlineForecaster
+from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneBatch, SceneSpec
 from tests.predictor.helpers import ROAD, any_model, model, random_presence, random_states, spec
 
 SOLID = SceneSpec(
@@ -116,6 +118,38 @@ def windows(history_steps: int = 4, horizon_steps: int = 3, **kwargs: int) -> Wi
     episode = Episode(states, present, np.arange(4))
     short = Episode(states[:5], present[:5], np.arange(4))
     return Windows([episode, short], spec(ROAD), history_steps, horizon_steps, **kwargs)
+
+
+class Counting(ConstantVelocity):
+    """Forecasts as many metres per step as it has seen steps of an agent, and forgets nothing by itself."""
+
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        return Memory((torch.zeros(batch, agents, 1),))
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        seen = memory.nodes[0] + valid[..., None]
+        return Memory((seen,)), replace(super().observe(memory, states, valid)[1], internal=seen)
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        states = belief.states[:, None, :, None].repeat(1, num_samples, 1, horizon_steps, 1)
+        states[..., :1] += belief.internal[:, None, :, None] * torch.arange(1, horizon_steps + 1)[:, None]
+        return Futures(states)
+
+
+def test_memory_of_an_agent_that_was_away_begins_anew_as_in_live_scenes():
+    states, valid = np.zeros((6, 2, 4), np.float32), np.ones((6, 2), np.bool_)
+    valid[2, 1] = False
+    episode = Episode(states, valid, np.array([5, 7]))
+    forecaster = Counting(spec(("world", "world"), has_ego=False))
+    made = Windows([episode], forecaster.spec, 10, 1)
+    live = OnlineForecaster(forecaster, 1, 2)
+    for now in range(5):
+        live.observe(SceneBatch(states[now][None].astype(float), episode.ids[None], valid[now][None], np.zeros(1)))
+        (row,) = np.flatnonzero(made.index[:, 1] == now)
+        outcome = run_window_batch(forecaster, made.batch(np.array([row])), 1)
+        there = valid[now]
+        assert torch.equal(outcome.forecast[0, 0, there], live.forecast(1).xy[0, 0, there])
+    assert outcome.forecast[0, 0, :, 0, 0].tolist() == [5.0, 2.0]
 
 
 def test_the_last_windows_may_be_all_or_none():

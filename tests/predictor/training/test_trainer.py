@@ -14,6 +14,7 @@ from torch import Tensor
 from predictor.checkpoint import load_checkpoint, save_checkpoint
 from predictor.data.device_windows import window_sizes
 from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.data.windows import Windows
 from predictor.dgvae.config import PRESETS
 from predictor.evaluation import outcomes as outcomes_module
 from predictor.models import build, name_of
@@ -311,6 +312,37 @@ def test_stretches_of_one_recording_stay_on_one_side_of_the_split(recordings: in
             assert len({labels[i] for i in held}) == 1 and len(held) == 4
         else:
             assert [e.seed for e in trained] == [e.seed for e in made] and len(held) == 2
+
+
+def test_a_recording_in_two_stores_is_on_one_side_of_the_split(circles: Path, tmp_path: Path):
+    walks = [replace(circling_episode(i), label=f"video {i}", seed=i) for i in range(12)]
+    for name, of_store in (("all", walks), ("half", walks[:6])):
+        recordings = {"recordings": [walk.label for walk in of_store]}
+        write_store(tmp_path / name, StoreInfo(spec(), "videos", recordings), of_store)
+    for seed in range(6):
+        both = replace(config(circles, tmp_path), data=(tmp_path / "all", tmp_path / "half"), seed=seed)
+        found = load_data(replace(both, val_fraction=0.25))
+        trained, held = speeds_in(found.train), speeds_in(found.val)
+        assert held and trained and not held & trained
+
+
+def speeds_in(parts: list[Windows]) -> set[int]:
+    """Returns the speeds of all agents, by which an episode of circles is known: they never change [0.1 mm/s]."""
+    found = [part.flat.states[..., 2:4].norm(dim=-1).flatten() for part in parts]
+    return {int(speed) for speed in (1e4 * torch.cat(found)).round().tolist() if speed > 0}
+
+
+def test_few_recordings_are_told(circles: Path, tmp_path: Path):
+    stretches = [replace(circling_episode(i), seed=i) for i in range(6)]
+    for name, recordings in (("two", [0, 0, 0, 1, 1, 1]), ("six", list(range(6)))):
+        write_store(tmp_path / name, StoreInfo(spec(), "videos", {"recordings": recordings}), stretches)
+    settings = replace(config(circles, tmp_path), val_fraction=0.2)
+    (told,) = load_data(replace(settings, data=(tmp_path / "two",))).notes
+    assert "two: 2 are too few recordings to hold out 20% of them, so stretches are held out beside those" in told
+    assert load_data(replace(settings, data=(tmp_path / "six",))).notes == ()
+    write_store(tmp_path / "one", StoreInfo(spec(), "videos", {"recordings": [0]}), stretches[:1])
+    with pytest.raises(UserError, match="1 episodes split into .* convert with a smaller --episode-steps, or pass --v"):
+        load_data(replace(settings, data=(tmp_path / "one",)))
 
 
 def test_stores_that_differ_in_frame_or_range_are_named(circles: Path, tmp_path: Path):
