@@ -16,13 +16,16 @@ from agents.runs import save_model
 from agents.task import Observe, Task, task_of
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from envs import ForecastObservation, make_env
+from envs import ForecastObservation, make_env, readers
 from envs.arms import ARMS
 from envs.drivers.trained import env_for_driver, parallel_env_for_driver
+from envs.readers import register_reader
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.registry import make_multiagent_env
 from predictor.checkpoint import resolve
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
-from tests.agents.helpers import TOY
+from tests.agents.helpers import LIVES, TOY, Meadow
 from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
 
 TAG = "simple_tag_v3"
@@ -361,3 +364,33 @@ def test_pettingzoo_arms_of_one_size_see_the_same_agents(tmp_path: Path):
     expected = seen_by(Task("simple_tag_v3", "forecast", checkpoint=near))
     for observe in ("zeros", "constant-velocity"):
         assert seen_by(Task("simple_tag_v3", observe, sizes_of=near)) == expected
+
+
+class MeadowReader:
+    """Both animals, a metre apart; a registered reader does not know of `perception_m`."""
+
+    spec = SceneSpec(dt_s=0.1, has_ego=False, max_agents=len(LIVES))
+
+    def __init__(self, env: Any) -> None:
+        pass
+
+    def reset(self) -> None:
+        pass
+
+    def read(self, env: Any) -> MultiagentScene:
+        states = np.array([[0.0, place, 1.0, 0.0] for place in range(len(LIVES))])
+        scene = Scene(states, np.arange(len(LIVES)), np.ones(len(LIVES), dtype=np.bool_))
+        present = {name: i for i, name in enumerate(LIVES) if name in env.unwrapped.agents}
+        return pad_multiagent_scene(scene, present, np.zeros(len(LIVES)), self.spec)
+
+
+def test_the_range_of_a_view_is_kept_where_the_reader_has_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(readers, "_REGISTERED", dict(readers._REGISTERED))
+    register_reader(Meadow, MeadowReader)
+    task = Task(TOY, "constant-velocity", perception_m=0.5, driver="random")
+    assert set(map(tuple, seen_by(task).values())) == {(0.0,)}
+    save_model(
+        make_model(TrainingPlan(task, "ppo", 200, 1, 0), make_venv(task, 1), None), tmp_path / "p.zip", note=task.note
+    )
+    env = parallel_env_for_driver(Meadow(), str(tmp_path / "p.zip"))
+    assert {agent: each["valid"].tolist() for agent, each in env.reset(seed=3)[0].items()} == seen_by(task)
