@@ -22,7 +22,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from predictor import train as training
 from predictor.checkpoint import load_checkpoint
-from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.store import Episode, StoreInfo, content_id, read_store, write_store
 from predictor.data.windows import WindowBatch
 from predictor.dgvae.config import PRESETS
 from predictor.evaluation.accuracy import summarise
@@ -307,6 +307,7 @@ def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Pa
     assert (info.spec, info.sources, info.horizon_steps, len(info.std_m)) == (spec(), ("circles",), 2, 2)
     assert info.provenance["result"]["val_constant_velocity_ade_m"] > 1.0
     assert info.provenance["train_config"]["steps"] == 7
+    assert info.provenance["stores"] == {str(circles): content_id(circles)}
     recorded = json.loads((out / "config.json").read_text())
     assert recorded["config"]["data"] == [str(circles)]
     assert recorded["provenance"]["versions"]["torch"] == version("torch")
