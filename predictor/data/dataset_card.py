@@ -30,6 +30,8 @@ class DatasetNotes:
     """Decisions of the loader: units, axes, what is dropped."""
     counts: Mapping[str, int] = field(default_factory=dict)
     """Number of things read, skipped or dropped, by name."""
+    advice: str = ""
+    """What to look at where no episode is left."""
 
 
 def save_dataset(
@@ -83,7 +85,8 @@ def check_not_empty(config: LoaderConfig, episodes: Sequence[Episode], notes: Da
         UserError: there is none.
     """
     if not episodes:
-        raise UserError(f"{config.source} gives no episode for split '{config.split}'; {_counted(notes) or 'no data'}")
+        told = "; ".join(part for part in (_counted(notes) or "no data", notes.advice) if part)
+        raise UserError(f"{config.source} gives no episode for split '{config.split}'; {told}")
 
 
 def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:

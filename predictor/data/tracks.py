@@ -372,6 +372,7 @@ def _notes(config: TracksConfig, frame_step: int, counts: Counter[str]) -> Datas
             cut if steps else "Each recording is one episode, from its first step with an agent to its last.",
         ),
         dict(counts),
+        "check --columns (are frame and id swapped?), --frame-step and --split",
     )
 
 
