@@ -395,7 +395,7 @@ def test_files_without_tracks(source: Path, walk: Path, loader: Loader):
     loader.refuses(source, f"{walk} holds no line of a track; remove the file or choose others with --pattern")
     walk.write_text("0 1 2 3\n10 2 2 3\n")
     loader.refuses(source, f"{source} gives no episode for split 'all'; files: 1")
-    loader.refuses(source, "check --columns (are frame and id swapped?), --frame-step and --split")
+    assert loader.run(source)[1][0].endswith("; check --columns (are frame and id swapped?), --frame-step and --split")
     loader.refuses(source, f"{source} holds no files of tracks (*.csv)", "--pattern", "*.csv")
 
 
