@@ -17,7 +17,8 @@ from envs.plans.playing import as_forecast
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
-from predictor.forecaster import Forecaster, require_forecaster
+from predictor.forecaster import Forecaster
+from predictor.forecaster_checks import require_forecaster
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError, short

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_futures, check_observed, check_scale
+from predictor.forecaster import Belief, Forecaster, Memory
+from predictor.forecaster_checks import check_empty, check_futures, check_observed, check_scale
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise, check_noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch

@@ -13,18 +13,8 @@ from typing import Any
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.forecaster import (
-    Belief,
-    Forecaster,
-    Futures,
-    Memory,
-    check_empty,
-    check_futures,
-    check_observed,
-    check_scale,
-    has_scale,
-    require_forecaster,
-)
+from predictor.forecaster import Belief, Forecaster, Futures, Memory, has_scale
+from predictor.forecaster_checks import check_empty, check_futures, check_observed, check_scale, require_forecaster
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError, named, reason_of, short

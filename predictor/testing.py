@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from predictor.forecaster import Belief, Futures, Memory, check_futures, check_scale, require_forecaster
+from predictor.forecaster import Belief, Futures, Memory
+from predictor.forecaster_checks import check_futures, check_scale, require_forecaster
 from predictor.forecaster_trial import AGENTS, SAMPLES, SCENES, STEPS, Trial
 from predictor.support.errors import UserError
 from predictor.what_if import ReactiveForecaster

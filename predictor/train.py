@@ -268,9 +268,10 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")
         return
     curve = config.out / CURVE_FILE
-    if not any((config.out / name).exists() for name in (STATE_FILE, CURVE_FILE, BEST_OF_RUN)):
-        return  # it ended before its first validation, for example by a loss that is not finite
     if not config.resume:
+        if not any((config.out / name).exists() for name in (STATE_FILE, CURVE_FILE, BEST_OF_RUN)):
+            read_object(config_file)
+            return  # that run ended before its first validation, for example by a loss that is not finite
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
     if not (config.out / STATE_FILE).exists() and any(p["step"] for p in read_curve(curve)):
         raise UserError(

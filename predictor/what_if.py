@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.forecaster import Belief, Forecaster, Futures, check_futures
+from predictor.forecaster import Belief, Forecaster, Futures
+from predictor.forecaster_checks import check_futures
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError

@@ -28,7 +28,8 @@ from envs.readers.base import SceneReader, bounded_spec, perceive, show
 from envs.registry import entry_for
 from envs.wrappers import SceneObservation, scene_source
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
-from predictor.forecaster import Forecaster, has_scale, require_forecaster
+from predictor.forecaster import Forecaster, has_scale
+from predictor.forecaster_checks import require_forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch
 from predictor.support.config_checks import check_at_least, check_types

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import load_checkpoint
-from predictor.forecaster import Belief, Futures, Memory, edgeless_belief, require_forecaster
+from predictor.forecaster import Belief, Futures, Memory, edgeless_belief
+from predictor.forecaster_checks import require_forecaster
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.testing import check_forecaster, forecaster_problems
