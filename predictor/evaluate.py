@@ -227,7 +227,7 @@ def main() -> None:
     console = Console()
     console.print(accuracy_table(accuracies, subject.spec.dt_s, title))
     if subject.note:
-        console.print(subject.note, markup=False)
+        console.print(subject.note, markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":
