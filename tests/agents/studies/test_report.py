@@ -185,13 +185,14 @@ def test_the_report_says_what_was_found(tmp_path: Path):
         assert cell.replace(">", "&gt;") in page, "both forms have the same cells"
 
 
-@pytest.mark.slow
 def test_one_crash_in_200_episodes_does_not_read_0_percent(tmp_path: Path):
     safe = result("slower", [1.0] * 200)
     once = replace(safe, episodes=tuple(e | {"crashed": not place} for place, e in enumerate(safe.episodes)))
-    assert "| 0.5 % (0.1 to 2.8) |" in written(tmp_path, [*results(), once])[0]
+    others = [each for each in results() if each.arm != "slower"]
+    assert "| 0.5 % (0.1 to 2.8) |" in written(tmp_path, [*others, once])[0]
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_else(tmp_path: Path):
     _, page = written(tmp_path, results())
     tags: list[tuple[str, dict[str, str | None]]] = []

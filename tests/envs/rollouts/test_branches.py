@@ -106,6 +106,7 @@ def test_an_agent_that_is_taken_out_has_no_shift():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "driver"), WORLDS)
+@pytest.mark.filterwarnings("ignore:step.. of env .* after an episode's end")
 def test_the_original_continues_as_if_it_was_never_copied(env_id: str, driver: str):
     world, untouched = (open_world(env_id, driver) for _ in range(2))
     for one in (world, untouched):
@@ -118,6 +119,7 @@ def test_the_original_continues_as_if_it_was_never_copied(env_id: str, driver: s
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("env_id", "driver"), WORLDS)
+@pytest.mark.filterwarnings("ignore:step.. of env .* after an episode's end")
 def test_the_plain_branch_is_what_then_happens(env_id: str, driver: str):
     world = open_world(env_id, driver)
     world.reset(11)
