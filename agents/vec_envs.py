@@ -36,7 +36,7 @@ from envs.sb3.workers import WorkerVecEnv
 from envs.scene_stream import NOISE_SEED_INFO
 from envs.seeding import driver_rng
 from envs.supervision import Place, SupervisedEnv, check_numbers, named
-from envs.wrappers import SceneObservation, scene_source
+from envs.wrappers import SceneObservation, scene_source, scenes_inside
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -254,14 +254,6 @@ def check_ends(steps: int, source: str) -> None:
         )
 
 
-def _scenes_inside(env: gym.Env) -> SceneObservation | None:
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, SceneObservation):
-            return env
-        env = env.env
-    return None
-
-
 class SeededEpisodes(gym.Wrapper):
     """Plays queued seeds one after another and puts an `EpisodeResult` into the last info of each episode.
 
@@ -281,7 +273,7 @@ class SeededEpisodes(gym.Wrapper):
         self._keys = outcome_keys(env, crash_key, success_key)
         self._action_names = {number: name for name, number in constant_actions(env).items()}
         self._recorder = recorder_for(env)
-        self._scenes = _scenes_inside(env)
+        self._scenes = scenes_inside(env)
         self._seeds: list[int] = []
         self._last: int | None = None
         self._driver_name: str | None = None

@@ -45,14 +45,13 @@ def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float
     return bounded(build_reader(make_reader, env), perception_m, max_agents)
 
 
-def _refuse_hidden_scenes(env: gym.Env) -> None:
+def scenes_inside(env: gym.Env) -> "SceneObservation | None":
+    """Returns the `SceneObservation` inside of an env, down to a wrapper that takes forecasts out; else None."""
     while isinstance(env, gym.Wrapper) and not getattr(type(env), "takes_out_forecasts", False):
         if isinstance(env, SceneObservation):
-            raise UserError(
-                "a wrapper around SceneObservation hides its scenes from ForecastObservation; put it inside of "
-                "SceneObservation, or around ForecastObservation"
-            )
+            return env
         env = env.env
+    return None
 
 
 class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
@@ -296,8 +295,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         num_plans = len(plan_model.names) if plan_model is not None and what_if else 0
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         ready = carries_scenes(env.observation_space)
-        if not ready:
-            _refuse_hidden_scenes(env)
+        if not ready and scenes_inside(env) is not None:
+            raise UserError(
+                "a wrapper around SceneObservation hides its scenes from ForecastObservation; put it inside of "
+                "SceneObservation, or around ForecastObservation"
+            )
         source = scene_source(env)
         if ready:
             refuse_reader(reader, "ForecastObservation over a SceneObservation", "SceneObservation(env, reader=...)")

@@ -115,7 +115,7 @@ def _load(config: EvaluateConfig) -> _Subject:
     name, horizon = MODEL_NAMES.get(info.model, info.model), config.horizon_steps or info.horizon_steps
     trained_on = info.provenance.get("stores")
     known = isinstance(trained_on, dict) and content_id(config.data) in trained_on.values()
-    note = f"{config.data} is a store that '{config.checkpoint}' was trained with: its errors elsewhere are larger"
+    note = f"{config.data} is a store that '{config.checkpoint}' was trained with: its errors elsewhere may be larger"
     return _Subject(store, info.spec, horizon, model, info.std_m, name, note if known else "")
 
 
