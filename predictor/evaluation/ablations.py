@@ -14,9 +14,9 @@ from predictor.evaluation.paper_tables import (
     TEACHER_FORCED,
     TINY,
     Line,
+    PaperTable,
     Protocol,
     Sizes,
-    Table,
 )
 
 _DRIVING = Protocol(burn_in_steps=5, horizon_steps=5, train_history_steps=10, train_horizon_steps=5)
@@ -37,15 +37,15 @@ _DRIVING_BUDGETS = {
 }
 
 
-def _on_springs(title: str, lines: tuple[Line, ...]) -> Table:
-    return Table(
+def _on_springs(title: str, lines: tuple[Line, ...]) -> PaperTable:
+    return PaperTable(
         title=f"5-Spring: {title}", train=SPRINGS.train, val=SPRINGS.val, tests=SPRINGS.tests,
         commands=SPRINGS.commands, lines=lines, budgets=_SPRINGS_BUDGETS,
     )  # fmt: skip
 
 
-def _in_driving(title: str, lines: tuple[Line, ...]) -> Table:
-    return Table(
+def _in_driving(title: str, lines: tuple[Line, ...]) -> PaperTable:
+    return PaperTable(
         title=f"highway-fast-v0: {title}", train="train/highway-fast-v0", tests={"test": "test/highway-fast-v0"},
         commands=_DRIVING_COMMANDS, lines=lines, budgets=_DRIVING_BUDGETS, test_stride=2, protocol=_DRIVING,
         overlap_m=2.0,
@@ -139,7 +139,7 @@ _TITLES = ("what each part of the dG-VAE+ is worth", "what each part of the mode
 _FITTED = {"fit_inputs": True}
 """Roads are longer than wide, so inputs are divided by their spread."""
 
-ABLATIONS: dict[str, Table] = {
+ABLATIONS: dict[str, PaperTable] = {
     "recipe": _on_springs(_TITLES[0], (*_recipe_lines({}, 150), _LABELS)),
     "recipe-driving": _in_driving(_TITLES[0], _recipe_lines(_FITTED, 500)),
     "modes": _on_springs(_TITLES[1], _mode_lines((), {})),

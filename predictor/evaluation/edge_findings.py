@@ -28,7 +28,7 @@ from predictor.graph import pair_mask
 
 
 @dataclass(frozen=True)
-class Reading:
+class LinearReading:
     """Linear estimate of an attribute from one feature dimension, for drawn graphs: offset + slope × feature."""
 
     dimension: int
@@ -104,7 +104,7 @@ class Findings:
     """Change of the features over the whole history."""
     stillness_late: Stillness
     """Change of the features over the second half of the history."""
-    reading: Reading | None
+    reading: LinearReading | None
     """Linear estimate of the first attribute, for drawn graphs."""
 
 
@@ -254,12 +254,12 @@ def _learned_by(name: str, learned: Sequence[str]) -> int | None:
     return learned.index(name) if name in learned else None
 
 
-def _reading(score: FactorScore, edges: LabelledPairs, labelled: int | None) -> Reading | None:
+def _reading(score: FactorScore, edges: LabelledPairs, labelled: int | None) -> LinearReading | None:
     """Returns the labelled dimension unchanged if it explains the attribute, else the best one with a fitted line."""
     if score.dimension is None or score.correlation is None:
         return None
     if labelled is not None and score.direct_r2 is not None and score.direct_r2 > 0:
-        return Reading(labelled)
+        return LinearReading(labelled)
     feature, attribute = edges.features[:, score.dimension].astype(np.float64), edges.attributes[:, 0]
     slope = score.correlation * float(attribute.std() / max(feature.std(), 1e-300))
-    return Reading(score.dimension, slope, float(attribute.mean() - slope * feature.mean()))
+    return LinearReading(score.dimension, slope, float(attribute.mean() - slope * feature.mean()))

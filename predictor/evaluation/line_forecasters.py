@@ -18,7 +18,7 @@ from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.controls import fit_noise, fit_residual
-from predictor.evaluation.paper_tables import NUM_SAMPLES, Line, Protocol, Sizes, Table
+from predictor.evaluation.paper_tables import NUM_SAMPLES, Line, PaperTable, Protocol, Sizes
 from predictor.scene import SceneSpec
 
 PAIR_BUDGET = 60_000
@@ -44,7 +44,7 @@ class LineForecaster:
 
 
 def line_forecaster(
-    table: Table, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, spec: SceneSpec, device: str
+    table: PaperTable, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, spec: SceneSpec, device: str
 ) -> LineForecaster:
     """Returns the forecaster of a line.
 
@@ -100,7 +100,7 @@ def fit_windows(episodes: Sequence[Episode], spec: SceneSpec, protocol: Protocol
     return Windows(episodes, spec, history, horizon, min_future_steps=horizon, min_history_steps=history)
 
 
-def _with_residuals(made: LineForecaster, table: Table, data: Path, sizes: Sizes) -> LineForecaster:
+def _with_residuals(made: LineForecaster, table: PaperTable, data: Path, sizes: Sizes) -> LineForecaster:
     """Returns the forecaster with samples around its single forecast."""
     episodes = _episodes(table, data, sizes)
     windows = fit_windows(episodes, made.forecaster.spec, table.protocol)
@@ -117,6 +117,6 @@ def _with_residuals(made: LineForecaster, table: Table, data: Path, sizes: Sizes
     return LineForecaster(residual, made.device, made.parameters, (), fitted)
 
 
-def _episodes(table: Table, data: Path, sizes: Sizes) -> Sequence[Episode]:
+def _episodes(table: PaperTable, data: Path, sizes: Sizes) -> Sequence[Episode]:
     """Returns the training episodes of a budget."""
     return read_store(data / table.train).episodes[: sizes.max_episodes or None]

@@ -19,7 +19,7 @@ from predictor.evaluation.displacement import MISS_THRESHOLD_M
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
 from predictor.evaluation.line_forecasters import LineForecaster, batch_size, line_forecaster
 from predictor.evaluation.outcomes import Outcome, run_windows
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, NUM_SAMPLES, Line, Sizes, Table
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, NUM_SAMPLES, Line, PaperTable, Sizes
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 
@@ -32,7 +32,7 @@ WINDOWS_SEED = 0
 
 
 def measure_line(
-    table: Table, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, seed: int, device: str
+    table: PaperTable, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, seed: int, device: str
 ) -> dict[str, Any]:
     """Returns the results of a line: parameters, what was fitted, and for each test store both views and scores."""
     stores = {kind: read_store(data / name) for kind, name in table.tests.items()}
@@ -55,7 +55,7 @@ def protocol_indices(
 
 
 def _measure_store(
-    made: LineForecaster, store: EpisodeStore, table: Table, line: Line, sizes: Sizes, seed: int
+    made: LineForecaster, store: EpisodeStore, table: PaperTable, line: Line, sizes: Sizes, seed: int
 ) -> dict[str, Any]:
     burn_in, horizon = table.protocol.burn_in_steps, table.protocol.horizon_steps
     try:
@@ -84,7 +84,7 @@ def _measure_store(
 class _Tallies:
     """Collects everything that is measured on one store."""
 
-    def __init__(self, made: LineForecaster, table: Table, line: Line, episodes: np.ndarray) -> None:
+    def __init__(self, made: LineForecaster, table: PaperTable, line: Line, episodes: np.ndarray) -> None:
         self._made, self._line, self._horizon = made, line, table.protocol.horizon_steps
         threshold_m = table.overlap_m or MISS_THRESHOLD_M
         self._horizon_only = Tally(made.std_m, threshold_m)

@@ -6,7 +6,7 @@ up to 39 of history and 10 of forecast. Figures of NRI: Table 1 of Kipf et al., 
 
 from typing import Any
 
-from predictor.evaluation.paper_tables import CONTROLS, SMALL, TEACHER_FORCED, TINY, Line, Protocol, Sizes, Table
+from predictor.evaluation.paper_tables import CONTROLS, SMALL, TEACHER_FORCED, TINY, Line, PaperTable, Protocol, Sizes
 
 _PROTOCOL = Protocol(burn_in_steps=49, horizon_steps=20, train_history_steps=39, train_horizon_steps=10)
 _ONE_WINDOW = 99
@@ -50,8 +50,8 @@ def _lines(types: int) -> tuple[Line, ...]:
     )  # fmt: skip
 
 
-NRI_TABLES: dict[str, Table] = {
-    "nri-springs": Table(
+NRI_TABLES: dict[str, PaperTable] = {
+    "nri-springs": PaperTable(
         title="NRI's springs, 5 particles",
         train="nri-springs/train",
         val="nri-springs/val",
@@ -67,7 +67,7 @@ NRI_TABLES: dict[str, Table] = {
             "Corr. (path)": 0.524, "Corr. (LSTM)": 0.527, "NRI (learned)": 0.999, "Supervised": 0.999,
         },
     ),
-    "nri-charged": Table(
+    "nri-charged": PaperTable(
         title="NRI's charged particles, 5 particles",
         train="nri-charged/train",
         val="nri-charged/val",

@@ -97,7 +97,7 @@ class Protocol:
 
 
 @dataclass(frozen=True)
-class Table:
+class PaperTable:
     """One table of the paper."""
 
     title: str
@@ -180,7 +180,7 @@ _LSTM_JOINT = ("joint=true",)
 _LABELLED: dict[str, Any] = {"label_weight": 200.0, "type_label_weight": 40.0}
 _SPRINGS_PLUS = _dgvae("dgvae", "dG-VAE+", 16, edge_cost=5.0)
 
-SPRINGS = Table(
+SPRINGS = PaperTable(
     title="5-Spring",
     train="springs/train",
     val="springs/val",
@@ -254,7 +254,7 @@ def _real_lines(
     )  # fmt: skip
 
 
-MOCAP = Table(
+MOCAP = PaperTable(
     title="Motion capture, subjects 35 and 39",
     train="mocap35_train",
     val="mocap35_val",
@@ -284,7 +284,7 @@ MOCAP = Table(
     },
 )  # fmt: skip
 
-NBA = Table(
+NBA = PaperTable(
     title="NBA",
     overlap_m=0.5,
     overlap_of="players",
@@ -319,7 +319,7 @@ _CROWD_BUDGETS = _REAL_BUDGETS | {
     "paper": Sizes(40_000, 1, 0, 300, 0, 1000),
 }
 
-SDD = Table(
+SDD = PaperTable(
     title="Stanford Drone Dataset",
     overlap_m=0.5,
     train="sdd_train",
@@ -337,7 +337,7 @@ SDD = Table(
     budgets=_CROWD_BUDGETS,
 )
 
-IND = Table(
+IND = PaperTable(
     title="inD, out of distribution rounD",
     overlap_m=2.0,
     train="ind_train",
@@ -360,7 +360,7 @@ IND = Table(
     budgets=_CROWD_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, SMALL)},
 )
 
-TABLES: dict[str, Table] = {
+TABLES: dict[str, PaperTable] = {
     "springs": SPRINGS,
     "mocap": MOCAP,
     "nba": NBA,

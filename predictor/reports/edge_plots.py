@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from predictor.evaluation.edge_findings import Reading
+from predictor.evaluation.edge_findings import LinearReading
 from predictor.evaluation.graph_accuracy import GraphAccuracy
 from predictor.reports.looks import AS_TEXT, BLUE, ORANGE, STYLE, YELLOW
 from predictor.reports.plots import plot_scene
@@ -137,7 +137,7 @@ def plot_graph(
 @rc_context(STYLE)
 def graphs_figure(
     windows: Sequence[WindowShown],
-    reading: Reading | None,
+    reading: LinearReading | None,
     attribute_names: Sequence[str],
     graph: GraphAccuracy,
     where: str,
@@ -193,7 +193,7 @@ def _percentile(column: int) -> str:
     return {0.0: "least accurate", 0.5: "median"}.get(quantile, f"{100 * quantile:.0f}th percentile")
 
 
-def _value_name(reading: Reading | None, names: Sequence[str]) -> str:
+def _value_name(reading: LinearReading | None, names: Sequence[str]) -> str:
     if reading is None or not names:
         return "the model's probability of an edge (truth: none)"
     if (reading.slope, reading.offset) == (1.0, 0.0):

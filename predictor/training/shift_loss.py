@@ -27,7 +27,7 @@ LARGE = 0.03
 (a lane change) do not decide alone."""
 
 
-class Shifts:
+class TwinShifts:
     """Draws pairs of branches and twins, and computes the loss on their shifts; all is a function of (seed, step).
 
     Args:
@@ -42,7 +42,7 @@ class Shifts:
     @staticmethod
     def of(
         config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, several_processes: bool
-    ) -> "Shifts | None":
+    ) -> "TwinShifts | None":
         """Finds the pairs among training episodes; None if shifts have no weight.
 
         Raises:
@@ -57,7 +57,7 @@ class Shifts:
             raise UserError(
                 "shift_weight needs branches with twins, got none; collect a store with --branches 4 --twins"
             )
-        return Shifts(config, twins)
+        return TwinShifts(config, twins)
 
     def loss(
         self,

@@ -37,7 +37,7 @@ from predictor.training.cuda_graph import (
 from predictor.training.objective import window_loss
 from predictor.training.processes import ALONE, Group, keep_rows_of_dropout
 from predictor.training.saved_state import read_state
-from predictor.training.shift_loss import Shifts
+from predictor.training.shift_loss import TwinShifts
 from predictor.training.start import initial_model
 from predictor.training.training_data import TrainingData
 
@@ -71,7 +71,7 @@ class Trainer:
         self.noise = torch.Generator(device=self.device)
         self._drawn: TrainingNoise = self.noise
         rows = group.rows(config.batch_size)
-        self._shifts = Shifts.of(config, data.train_episodes, data.spec, group.connected)
+        self._shifts = TwinShifts.of(config, data.train_episodes, data.spec, group.connected)
         if group.connected or self._shifts is not None:
             # a recorded step would hold the messages between processes, or the first pairs
             config = replace(config, capture="off")

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from predictor.evaluation import paper_tables
 from predictor.evaluation.accuracy import Accuracy
-from predictor.evaluation.paper_tables import Table
+from predictor.evaluation.paper_tables import PaperTable
 from predictor.reports.looks import GREY
 from predictor.reports.plots import PlainLogFormatter, figure_by_step, plot_error_by_horizon, plot_scene
 
@@ -59,7 +59,7 @@ def test_scene_has_solid_history_dashed_forecast_and_thin_truth(ax: Axes):
 
 @pytest.mark.parametrize("name", ["SPRINGS", "NBA"])
 def test_figures_by_step_have_room_for_the_names_of_their_lines(name: str):
-    table: Table = getattr(paper_tables, name)
+    table: PaperTable = getattr(paper_tables, name)
     view = {"by_step_m": [1.0, 2.0], "step_errors": {"by_step_m": [0.1, None]}, "num_samples": 7}
     tests = {kind: {"horizon_only": view} for kind in table.tests}
     results = [{"key": line.key, "name": line.name, "tests": tests} for line in table.lines]

@@ -13,7 +13,7 @@ from predictor.forecaster import Futures, WindowOutput
 from predictor.support.errors import UserError
 from predictor.training.config import TrainConfig
 from predictor.training.mode_loss import unit
-from predictor.training.shift_loss import LARGE, Shifts, shift_loss
+from predictor.training.shift_loss import LARGE, TwinShifts, shift_loss
 from tests.predictor.data.test_twins import HISTORY, HORIZON, twins_of
 from tests.predictor.helpers import PLURAL, spec
 
@@ -77,9 +77,9 @@ def test_one_observed_step_shows_no_removal(tmp_path: Path):
 def test_several_processes_do_not_share_pairs(tmp_path: Path):
     config = TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY)
     episodes = list(twins_of(0, 3.0))
-    assert Shifts.of(config, episodes, spec(has_ego=True), several_processes=False) is not None
+    assert TwinShifts.of(config, episodes, spec(has_ego=True), several_processes=False) is not None
     with pytest.raises(UserError, match="shift_weight needs one process; train on one device, or set it to 0"):
-        Shifts.of(config, episodes, spec(has_ego=True), several_processes=True)
+        TwinShifts.of(config, episodes, spec(has_ego=True), several_processes=True)
 
 
 def test_both_windows_of_a_pair_have_equal_noise(tmp_path: Path):
@@ -87,7 +87,7 @@ def test_both_windows_of_a_pair_have_equal_noise(tmp_path: Path):
     config = TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY)
     branch, twin = twins_of(0, 0.0)
     same = replace(twin, perturbed=branch.perturbed)
-    shifts = Shifts.of(config, [same, twin], spec(has_ego=True), several_processes=False)
+    shifts = TwinShifts.of(config, [same, twin], spec(has_ego=True), several_processes=False)
     assert shifts is not None
     network = DGVAE(spec(has_ego=True), PLURAL, 2).train()
     assert shifts.loss(network, 0, 2, SCALES, num_modes=2).item() == 0
@@ -107,7 +107,7 @@ def test_each_step_and_seed_draws_its_own_pairs(tmp_path: Path, monkeypatch: pyt
         (tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY, batch_size=16
     )
     for seed, step in ((0, 0), (0, 1), (0, 0), (1, 0)):
-        shifts = Shifts.of(replace(settings, seed=seed), episodes, spec(has_ego=True), several_processes=False)
+        shifts = TwinShifts.of(replace(settings, seed=seed), episodes, spec(has_ego=True), several_processes=False)
         assert shifts is not None
         shifts.loss(network, step, 2, SCALES)
     first, later, again, other = (pairs.tolist() for pairs in drawn)
