@@ -80,8 +80,8 @@ class TuneConfig:
     selection_episodes: int = 20
     """Number of episodes per such measurement."""
     checkpoint: str | None = None
-    """Forecaster whose shape the zeros have; None takes the checkpoint that ships for the env id, and so does one of
-    one's own where one ships."""
+    """Forecaster whose shape the zeros have; None, or one of your own, takes the checkpoint that ships for the env id,
+    if there is one."""
     checkpoint_every: int = 2_000
     """Number of environment steps between the checkpoints of a training. Episodes end there, so `checkpoint_every /
     num_envs` should be well above their length."""

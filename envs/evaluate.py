@@ -92,7 +92,7 @@ class EvaluateConfig:
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""
     num_samples: int = 20
-    """Number of forecasts drawn (K) for the second line; the first is K = 1, the single forecast."""
+    """Number of forecasts (K) of the best-of-K error; K = 1, the single forecast, is always measured, too."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes each checkpoint's."""
     memory_steps: tuple[int, ...] = ()
