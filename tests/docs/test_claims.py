@@ -21,9 +21,7 @@ from predictor.training.config import OF_THE_DGVAE, TrainConfig
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 README = (ROOT / "README.md").read_text()
-LIMITS, OBSERVATIONS, PREDICTORS = (
-    (ROOT / "docs" / f"{name}.md").read_text() for name in ("limits", "observations", "predictors")
-)
+LIMITS, OBSERVATIONS = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("limits", "observations"))
 RESULTS = (ROOT / "docs" / "results.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
 CONTROL = "constant velocity + noise"
@@ -69,7 +67,6 @@ def test_every_table_of_results_has_the_stochastic_control():
     errors = [lines for lines in found if any("minADE" in heading for heading in lines[0])]
     assert (len(found), len(errors)) == (16, 12)  # two views and the graph of four, three with two sets; three seeds
     assert all(CONTROL in {line[""] for line in lines} for lines in errors)
-    assert any(CONTROL in {line[""] for line in lines} for lines in lines_with_k(PREDICTORS))
 
 
 @pytest.mark.parametrize("title", ["NBA", "Stanford Drone Dataset", "5-Spring", "Motion capture"])
