@@ -268,6 +268,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--env-ids merge-v1 merge-v1", "env_ids must differ, got merge-v1, merge-v1"),
         ("--out .", FOLDER),
     ],
+    "benchmarks.foreseeable": [
+        ("--draws 0", "draws must be at least 1, got 0"),
+        ("--policy absent", "no policy"),
+        ("--policy roundabout", "policy 'roundabout' must see forecasts of simple_tag_v3"),
+        ("--checkpoint roundabout", "checkpoint 'roundabout' must be a network of simple_tag_v3 whose agents react"),
+        ("--out .", FOLDER),
+    ],
     "benchmarks.rows": [
         ("--num-envs 0", "num_envs needs numbers of at least 1, got (0,)"),
         ("--max-rows 0", "max_rows must be at least 1, got 0"),

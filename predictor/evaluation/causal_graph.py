@@ -183,7 +183,8 @@ def best_bound(score: Float[np.ndarray, " pairs"], exists: Bool[np.ndarray, " pa
     """Returns the bound above which scores have the highest F1; None without an edge."""
     if not exists.any():
         return None
-    found, hits, taken = _by_score(score, exists, np.ones((1, len(score))))
+    # in float32 the middle of two neighbouring scores is one of them
+    found, hits, taken = _by_score(score.astype(np.float64), exists, np.ones((1, len(score))))
     f1 = 2 * hits[0].cumsum() / (taken[0].cumsum() + exists.sum())
     best = int(np.argmax(f1))
     below = found[best + 1] if best + 1 < len(found) else found[best] - 1.0

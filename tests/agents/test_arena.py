@@ -334,3 +334,20 @@ def test_a_policy_that_sees_images_is_played(monkeypatch: pytest.MonkeyPatch):
         arena.close()
     finally:
         del gym.registry["Film-v0"]
+
+
+def test_random_stand_ins_of_learners_and_random_others_draw_independently(monkeypatch: pytest.MonkeyPatch):
+    """The prey would do what the first predator does if both drew from one stream."""
+    arena = open_arena(Task("simple_tag_v3", "none", learners=("adversary",), driver="random"), 1)
+    assert isinstance(arena, MultiagentArena)
+    moved: list[tuple[int, int]] = []
+    step = arena._env.step
+
+    def spied(actions: Any) -> Any:
+        moved.append((int(actions["adversary_0"]), int(actions["agent_0"])))
+        return step(actions)
+
+    monkeypatch.setattr(arena._env, "step", spied)
+    arena.play("random", range(8))
+    assert any(learner != other for learner, other in moved[::25])  # the first step of each episode
+    arena.close()

@@ -355,3 +355,9 @@ def test_agents_that_a_wrapper_has_scaled_away_are_named():
 def test_entries_that_a_wrapper_has_stacked_are_named():
     with pytest.raises(UserError, match=r"entries as the wrapper gives them, .*leave out what stacks .*VecFrameStack"):
         ppo(vector(lambda venv: VecFrameStack(venv, 2)))
+
+
+def test_one_further_feature_with_a_scale_is_enough_for_all_to_be_kept():
+    names = (*SceneSpec(dt_s=0.1).feature_names, "z_m", "role")
+    spec = SceneSpec(dt_s=0.1, feature_names=names, feature_scales=(100.0, 100.0, 30.0, 30.0, 3000.0, 1.0))
+    assert AttentionConfig.for_scenes(spec).more_scales == (3000.0, 1.0)

@@ -260,3 +260,10 @@ def test_actions_of_plans_are_actions_of_the_environment(actions: tuple[int, ...
     monkeypatch.setattr(plan_scores, "plan_model_for", lambda env: SimpleNamespace(actions=actions))
     with pytest.raises(UserError, match=r"actions must be actions of Discrete\(5\), got \(0, 1, "):
         plan_actions(Task("highway-fast-v0", "constant-velocity", what_if=True))
+
+
+def test_the_optimizer_of_ppo_trains_the_scores_and_the_layer_of_the_logits():
+    """SB3 makes its optimizer before the layer of the logits is replaced."""
+    policy = make_ppo().policy
+    trained = {id(p) for group in policy.optimizer.param_groups for p in group["params"]}
+    assert trained == {id(p) for p in policy.parameters()}

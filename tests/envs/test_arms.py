@@ -255,3 +255,33 @@ def test_a_bank_of_other_sizes_is_refused(bank: EntryBank):
 def test_a_bank_is_recorded_from_whole_forecasts(options: dict[str, Any], words: str):
     with pytest.raises(UserError, match=f"a bank is recorded with the arm 'forecast' and flatten=False, .*{words}"):
         record_bank(ForecastObservation(make_env(FAST), "highway", **options), "highway")
+
+
+def test_a_predator_is_told_one_true_future_where_there_is_room_for_several():
+    env = ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "simple-tag", num_samples=3, arm=Arm("oracle"))
+    observations, _ = env.reset(seed=0)
+    for seen in observations.values():
+        there = seen["valid"].astype(bool)
+        assert seen["forecast"][there, 0].any() and not seen["forecast"][:, 1:].any()
+        assert (seen["mode_probs"][there, 0] == 1.0).all() and not seen["xy_scale"].any()
+    env.close()
+
+
+def test_an_arm_without_edges_needs_no_room_for_them():
+    own, _ = load_checkpoint("highway")
+    small = EntryLayout(num_edge_types=1, edge_feature_dim=0, has_scale=False)
+    for name in ("zeros", "no-edges", "oracle"):
+        assert Arm(name, small).layout_for(own) == small
+    with pytest.raises(
+        UserError, match=r"the forecaster has edges of \d+ types with \d+ features, and the observation"
+    ):
+        Arm("single", small).layout_for(own)
+
+
+@pytest.mark.parametrize(
+    ("name", "what_if", "played"),
+    [("oracle", True, 1), ("oracle", False, 1), ("oracle-what-if", True, None), ("what-if", True, 0)],
+)
+def test_only_plans_that_are_shown_are_played(name: str, what_if: bool, played: int | None):
+    """Each one costs a copy of the simulator in every step."""
+    assert Arm(name).plays(what_if) == played

@@ -305,3 +305,13 @@ def test_a_negative_seed_is_named():
     assert ForecastConfig(seed=0).seed == 0
     with pytest.raises(UserError, match="seed must not be negative, got -1"):
         ForecastConfig(seed=-1)
+
+
+@pytest.mark.parametrize("num_plans", [0, 2])
+def test_forecasts_for_plans_use_up_no_noise(num_plans: int):
+    config = ForecastConfig(num_samples=SAMPLES, num_plans=num_plans)
+    asked, plain = (SceneStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, ENVS, config) for _ in range(2))
+    for t in range(3):
+        assert_same(asked.take(scenes(t)).xy.numpy(), plain.take(scenes(t)).xy.numpy(), tolerance=0.0)
+        first, second = (asked.what_if(plans_of(scenes(t)).states) for _ in range(2))
+        assert_same(first.xy.numpy(), second.xy.numpy(), tolerance=0.0)

@@ -658,3 +658,22 @@ def test_an_absent_ego_is_refused_where_positions_are_relative_to_it():
         forecaster.observe(SceneBatch.stack([here.behind_absent(1)]))
     forecaster.observe(SceneBatch.stack([scene(states_of(0, 0, 3, 7), AGENTS)]))
     OnlineForecaster(model(), 1, AGENTS).observe(SceneBatch.stack([here.behind_absent(1)]))
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_a_spread_that_is_no_number_is_refused_but_of_absent_agents(everywhere: bool):
+    class Odd(ConstantVelocity):
+        has_scale = True
+
+        def rollout(self, belief: Any, *arguments: Any, **named: Any) -> Futures:
+            states = super().rollout(belief, *arguments, **named).states
+            wrong = ~belief.valid[:, None, :, None, None] | everywhere
+            return Futures(states, None, torch.ones_like(states[..., :2]).masked_fill(wrong, torch.nan))
+
+    stream = online(Odd(spec()))
+    stream.observe(batch(scene(states_of(0, 0, 3, 7), AGENTS, [0, PADDING_ID, 7, 3])))
+    if not everywhere:
+        assert not stream.forecast(5).valid[0, 1]
+        return
+    with pytest.raises(UserError, match="forecasts numbers that are not finite; its weights are damaged or diverged"):
+        stream.forecast(5)

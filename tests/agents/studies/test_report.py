@@ -316,3 +316,10 @@ def test_no_share_is_told_of_a_headroom_whose_interval_reaches_zero():
     headroom = findings.headroom("one", "ppo")
     assert headroom is not None and headroom.value == pytest.approx(2.0) and headroom.interval[0] < 0
     assert findings.headroom_used("one", SEEN) is None
+
+
+def test_a_driver_that_is_best_ends_the_scale_of_rescaled_scores():
+    driven = [result("heuristic", [18.0, 18.0], scenario=name) for name in ("one", "two")]
+    findings = found_in(study(("one", "two")), [*results(), *results("two"), *driven])
+    scaled = findings.scaled_runs(SEEN, ["one", "two"])
+    assert [float(np.mean(runs)) for runs in scaled] == pytest.approx([3 / 16] * 2), "2 is the lowest, 18 the highest"

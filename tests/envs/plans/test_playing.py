@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from envs import ForecastObservation, make_env
 from envs.arms import Arm
 from envs.plans import Plans
-from envs.plans.playing import with_true_futures
+from envs.plans.playing import followed, with_true_futures
 from envs.readers import EntityRowsReader, FunctionReader
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
@@ -273,3 +273,11 @@ def test_a_simulator_that_copies_as_it_was_made_is_played_from_where_it_is():
     assert over.true_xy[:, 1, :, 0].tolist() == [[20.0, 22.0]] * 2
     env.reset(seed=0)
     assert env.make_plans(TwoPlans(), 2, None).true_xy[0, 1, :, 0].tolist() == [12.0, 16.0]
+
+
+def test_an_agent_that_is_not_valid_any_more_goes_on_at_its_last_velocity_although_its_id_stays():
+    states = np.array([[0.0, 0.0, 1.0, 0.0], [5.0, 0.0, 0.0, 2.0]])
+    now = Scene(states, np.array([3, 4]), np.array([True, True]))
+    later = np.array([[0.5, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    gone = Scene(later, np.array([3, 4]), np.array([True, False]))
+    np.testing.assert_array_equal(followed(now, 0.5, [gone, None])[1], [[5.0, 1.0], [5.0, 2.0]])

@@ -425,3 +425,23 @@ def test_an_episode_is_a_function_of_its_task(tmp_path: Path):
         assert torch.equal(first[key].forecast, again[key].forecast)
         assert torch.equal(first[key].future, again[key].future)
     assert not torch.equal(first[MODEL].future, other[MODEL].future)
+
+
+@pytest.mark.parametrize("crash_in_step", [1, 3])
+def test_an_episode_that_goes_on_after_a_crash_has_not_ended_with_it(
+    crash_in_step: int, monkeypatch: pytest.MonkeyPatch
+):
+    """What is measured before a crash are the last steps of an episode that ends with one."""
+    world, steps = open_world("two-way-v0", "idle", "constant-velocity", horizon_steps=2), iter(range(1, 4))
+    step_world = world.step
+
+    def step() -> bool:
+        step_world()
+        now = next(steps)
+        world.crashed = now >= crash_in_step
+        return now == 3
+
+    monkeypatch.setattr(world, "step", step)
+    monkeypatch.setattr(episodes, "_world", lambda task: world)
+    assert play(EpisodeTask("two-way-v0", "constant-velocity", "idle", 0, 1, 2, 9)).crashed == (crash_in_step == 3)
+    world.close()

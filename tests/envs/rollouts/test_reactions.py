@@ -372,3 +372,21 @@ def test_an_ego_perceives_what_its_checkpoint_was_trained_on(highway_checkpoint:
     assert plain.spec.max_agents != HIGHWAY_SPEC.max_agents
     own = open_for_checkpoints("two-way-v0", "idle", ("constant-velocity", f"own:{__name__}:Shortsighted"))
     assert (own.spec.perception_m, own.spec.max_agents) == (30.0, 3)
+
+
+def test_what_was_tried_is_looked_up_for_other_receivers_when_no_more_may_be_tried(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reactions, "MOST_BRANCHES", 1)
+    monkeypatch.setattr(reactions, "pairs_of", lambda *_: [(4, 2), (1, 2)])  # 4 is on another lane and does not move
+    asked = moment(queue(), {})
+    found = [asked.perturbed(ON_LANES[-1], np.random.default_rng(seed)) for seed in range(6)]
+    assert all(one is not None and one.receiver == 1 for one in found)
+
+
+def test_a_receiver_is_compared_with_itself_where_one_that_is_taken_out_leaves_a_place():
+    """Agents are sorted by distance to the ego, here ahead: those behind one that is gone stand a place earlier."""
+    world = road_world(*QUEUE, ego_m=(80.0, 12.0))
+    world.step()
+    asked = moment(world, {"straight": SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)})
+    found = [asked.perturbed(ON_LANES[-1], np.random.default_rng(seed)) for seed in range(4)]
+    shifts = [one.predicted_m["straight"] for one in found if one is not None]
+    assert shifts and np.abs(shifts).max() < 1e-6

@@ -445,3 +445,16 @@ def test_all_that_a_rollout_needs_is_on_the_device_of_the_model(variant: str, sa
         futures = model.rollout(now, HORIZON, samples)
     assert {t.device for t in futures if t is not None} == {meta}
     assert futures.states.shape == (BATCH, samples, AGENTS, HORIZON, 4)
+
+
+def test_messages_of_agents_to_themselves_act_in_every_substep():
+    """As those of the others: `test_substeps_against_a_loop` of a model with modes."""
+    model, now = made("rich"), belief("rich")
+    moved, known, self_edges = now.states, now.internal, model.self_edges
+    held, change = self_edges.hold(known.own), model.decoder.change(known.node_after)
+    for _ in range(2):
+        inputs = model.codec.inputs(moved, now.valid)
+        others = model.decoder.messages(inputs, known.graph.present, known.probs, known.features)
+        pushed = model.decoder.direct(others + self_edges.out(self_edges.layer(inputs, held)))
+        moved = model.codec.advance(moved, change + pushed, 0.5)
+    torch.testing.assert_close(model.rollout(now, 1).states[:, 0, :, 0][now.valid], moved[now.valid], **CLOSE)

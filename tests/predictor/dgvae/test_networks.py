@@ -256,3 +256,13 @@ def test_paper_preset_has_the_sizes_of_the_paper():
     paper = PRESETS["paper"]
     assert (paper.hidden_dim, paper.rnn_dim, paper.head_dim, paper.decoder_dim) == (128, 64, 256, 256)
     assert (paper.num_edge_types, paper.temperature, paper.residual) == (2, 0.5, "state")
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_rare_types_are_drawn_in_full_precision(kind: torch.dtype):
+    """The noise of half precision has no tails that are fine enough."""
+    logits = torch.tensor([0.0, -7.0]).expand(100_000, 2).to(kind)
+    drawn, exact = (
+        concrete_sample(x, 0.5, torch.Generator().manual_seed(0), hard=True) for x in (logits, logits.float())
+    )
+    assert torch.equal(drawn, exact) and 50 < drawn[:, 1].sum() < 140

@@ -428,3 +428,9 @@ def test_probabilities_of_absent_agents_do_not_matter():
         tally.add(replace(OUTCOMES[1], forecast=OUTCOMES[0].forecast[:, :, :1], mode_probs=shown))
         found.append(tally)
     assert str(found[0].accuracy("x")) == str(found[1].accuracy("x"))
+
+
+def test_the_energy_score_is_of_agents_that_are_known_throughout():
+    """As the other means, so that all are over forecasts of equal length."""
+    first = outcome([[[1.0, 3.0], [5.0, 9.0]]], [[True, True], [True, False]])
+    assert summarise("model", [first]).energy_m == summarise("model", [first]).ade_m == 2.0

@@ -89,6 +89,13 @@ def test_the_best_bound_has_the_highest_f1_of_all(seed: int):
     assert best_bound(score, np.zeros_like(exists)) is None
 
 
+def test_the_best_bound_lies_between_neighbouring_scores_of_half_the_precision():
+    """In float32 their middle is the greater one, above which there is no score."""
+    score = np.array([1.0, np.nextafter(np.float32(1), np.float32(0)), 0.1, 0.2], dtype=np.float32)
+    bound = best_bound(score, np.array([True, False, False, False]))
+    assert bound is not None and (score > bound).tolist() == [True, False, False, False]
+
+
 def test_all_is_measured_on_the_second_half_and_the_bound_fitted_on_the_first():
     """In the first half edges score above 2, in the second above 5; both rules would be perfect on their own half."""
     exists = [True, True, False, False] * 2

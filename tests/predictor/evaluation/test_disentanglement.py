@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import r2_score
 
-from predictor.evaluation.disentanglement import dci, direct_r2, linear_r2, mig, mutual_information
+from predictor.evaluation.disentanglement import _first_half, dci, direct_r2, linear_r2, mig, mutual_information
 from predictor.support.errors import UserError
 
 POINTS = 4000
@@ -289,3 +289,11 @@ def test_mutual_information_of_independent_columns_is_not_biased():
 def test_bins_must_divide():
     with pytest.raises(ValueError, match="bins must be at least 2, got 1"):
         mig(factors(), factors(), bins=1)
+
+
+def test_dci_fits_nothing_to_the_half_that_is_scored():
+    """Neither the regressor nor the scales of its inputs."""
+    known, kept = factors(points=400), _first_half(400, None, 0)
+    features = known + 0.3 * np.random.default_rng(1).normal(size=known.shape)
+    wider = [np.where(kept[:, None], v, 3 * v - 2 * v[kept].mean(0)) for v in (features, known)]
+    assert dci(*wider).importance == dci(features, known).importance

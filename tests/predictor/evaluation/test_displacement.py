@@ -653,3 +653,9 @@ def test_coverage_against_a_loop(batch: tuple[Tensor, Tensor, Tensor], share: fl
         distance = float((future[scene, agent, step].double() - points.mean(0)).norm())
         if abs(distance - limit) > 1e-4:
             assert value[scene, agent, step].item() == float(distance < limit)
+
+
+def test_truth_beyond_exactly_the_share_of_the_probability_is_outside():
+    modes, probs = one_agent(along_x(0), along_x(2)), torch.tensor([0.75, 0.25])[None, :, None]
+    value, _ = coverage(modes, along_x(-0.75)[None, None], ALL[..., :1], 0.75, probs)
+    assert value.item() == 0.0, "0.75 of the probability is nearer, not less"

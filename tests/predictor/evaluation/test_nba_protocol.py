@@ -264,3 +264,13 @@ def test_the_covariance_is_that_of_the_players_errors(tmp_path: Path):
     std_m = noisy.std_m(HORIZON_STEPS).numpy()
     np.testing.assert_allclose(std_m[:, 1], off_m, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(std_m[:, 0], 0.0, atol=1e-4)
+
+
+def test_a_player_who_leaves_before_the_last_frame_does_not_count(tmp_path: Path):
+    windows, _ = walks(tmp_path, (25,))
+    tally = PlayerTally(1)
+    for possession_of, outcome in player_outcomes(ConstantVelocity(windows.spec), windows, np.arange(2), 1):
+        valid, players = outcome.valid.clone(), outcome.valid[0].all(-1).nonzero()[:, 0]
+        valid[:, players[:4], HORIZON_STEPS // 2 :] = False
+        tally.add(possession_of, replace(outcome, valid=valid))
+    assert tally.errors("it").forecasts == 2 * (10 - 4)

@@ -370,3 +370,11 @@ def test_the_rate_falls_without_a_jump_to_the_last_step():
     assert rates[100] == pytest.approx(2.0, rel=1e-3)  # the fall begins where the warm-up ends
     assert rates[550] == pytest.approx(2.0 * (0.02 + 0.98 / 2))  # half-way
     assert rates[-2] > rates[-1] > 0.04
+
+
+def test_the_memory_that_a_process_needs_is_that_of_its_rows(monkeypatch: pytest.MonkeyPatch):
+    given: list[int] = []
+    monkeypatch.setattr(batches_module, "check_memory", lambda needed, *_: given.append(needed))
+    open_batches(CONFIG, windows(), CPU)
+    open_batches(CONFIG, windows(), CPU, rows=slice(0, CONFIG.batch_size // 3))
+    assert given[1] == given[0] // 3

@@ -1,0 +1,48 @@
+"""How much of the prey's future could be foreseen (`benchmarks.foreseeable`)."""
+
+import functools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.policy import load_policy
+from benchmarks import foreseeable
+from benchmarks.foreseeable import NAMES, generators_of, redrawn
+from envs.plans.keeping_on import all_keeping_on
+
+
+def test_all_random_streams_of_a_driver_are_found():
+    common, own, other = (np.random.default_rng(seed) for seed in range(3))
+    driver = functools.partial(print, common, {"agent_0": functools.partial(print, own, [], by=other)}, 1)
+    assert {*map(id, generators_of(driver))} == {*map(id, (common, own, other))}
+
+
+def test_copies_draw_anew_and_leave_the_world_as_it_was():
+    policy, env = load_policy("simple-tag")
+    observations, _ = env.reset(seed=3)
+    for _ in range(4):
+        actions = policy(observations)
+        observations, *_ = env.step(actions)
+    told = env.scene.scene, observations, actions, 10
+    prey = env.scene.index_of["agent_0"]
+    before = all_keeping_on(env.env, env.reader, *told)
+    rng = np.random.default_rng(0)
+    drawn = [all_keeping_on(copied, reader, *told)[prey] for copied, reader in (redrawn(env, rng) for _ in range(8))]
+    assert len({each.tobytes() for each in drawn}) > 1  # the prey's driver draws in most steps
+    np.testing.assert_array_equal(all_keeping_on(env.env, env.reader, *told), before)
+
+
+@pytest.mark.slow
+def test_the_command_prints_an_error_for_each_forecaster(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+):
+    arguments = ["foreseeable", "--episodes", "1", "--draws", "4", "--out", str(tmp_path / "found.json")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    foreseeable.main()
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["steps"] == 24 and tuple(found["ade_m"]) == NAMES
+    assert all(f"| {name} | {found['ade_m'][name]:.3f} |" in capsys.readouterr().out for name in NAMES[:1])
+    assert found["ade_m"][NAMES[4]] < found["ade_m"]["constant velocity"]
