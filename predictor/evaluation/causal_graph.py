@@ -155,9 +155,10 @@ def score_rule(
         probability: whether the score is a probability, which has a calibration.
     """
     fit, test = halves(pairs)
+    score = score.astype(np.float64)  # in float32 the middle of two neighbouring scores is one of them
     fitted_bound = best_bound(score[fit], pairs.exists[fit])
     bound = fitted_bound if bound is None else bound
-    score, pairs = score[test].astype(np.float64), pairs.where(test)
+    score, pairs = score[test], pairs.where(test)
     if not len(pairs):
         return CausalScores(0, 0, 0.0, bound)
     decisions = {} if bound is None else _decisions(score, pairs, bound)
@@ -183,8 +184,7 @@ def best_bound(score: Float[np.ndarray, " pairs"], exists: Bool[np.ndarray, " pa
     """Returns the bound above which scores have the highest F1; None without an edge."""
     if not exists.any():
         return None
-    # in float32 the middle of two neighbouring scores is one of them
-    found, hits, taken = _by_score(score.astype(np.float64), exists, np.ones((1, len(score))))
+    found, hits, taken = _by_score(score, exists, np.ones((1, len(score))))
     f1 = 2 * hits[0].cumsum() / (taken[0].cumsum() + exists.sum())
     best = int(np.argmax(f1))
     below = found[best + 1] if best + 1 < len(found) else found[best] - 1.0

@@ -89,11 +89,11 @@ def test_the_best_bound_has_the_highest_f1_of_all(seed: int):
     assert best_bound(score, np.zeros_like(exists)) is None
 
 
-def test_the_best_bound_lies_between_neighbouring_scores_of_half_the_precision():
+def test_a_bound_lies_between_neighbouring_scores_of_half_the_precision():
     """In float32 their middle is the greater one, above which there is no score."""
-    score = np.array([1.0, np.nextafter(np.float32(1), np.float32(0)), 0.1, 0.2], dtype=np.float32)
-    bound = best_bound(score, np.array([True, False, False, False]))
-    assert bound is not None and (score > bound).tolist() == [True, False, False, False]
+    score = np.array([1.0, np.nextafter(np.float32(1), np.float32(0)), 0.1, 0.2] * 2, dtype=np.float32)
+    found = score_rule(score, pairs([True, False, False, False] * 2, [0] * 4 + [1] * 4), None)
+    assert value(found.f1) == value(found.auc) == 1.0
 
 
 def test_all_is_measured_on_the_second_half_and_the_bound_fitted_on_the_first():
