@@ -51,7 +51,7 @@ Shows a reinforcement-learning policy what the other agents are about to do.
 {chr(10).join(f"  {name:16} {command.does}" for name, command in COMMANDS.items())}
 
 Examples:
-  dgvae train-policy --what-if --num-samples 6 --steps 3000 --set gamma=0.85 --out runs/mine
+  dgvae train-policy --what-if --num-samples 6 --steps 3000 --out runs/mine
   dgvae watch runs/mine
 
 dgvae COMMAND --help explains every option, dgvae --version prints the version."""

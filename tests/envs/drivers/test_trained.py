@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 from stable_baselines3 import PPO
 
 from agents.arena import MultiagentArena
@@ -141,7 +142,8 @@ def test_a_forecaster_that_was_trained_anew_in_place_is_noticed(measured: str | 
     shutil.copytree(PRETRAINED / "simple-tag", mine)
     path, _ = save_run(tmp_path, Task("simple_tag_v3", "forecast", str(mine), learners=("adversary",)))
     open_world("simple_tag_v3", path, measured).close()
-    shutil.copy(PRETRAINED / "particles" / "model.safetensors", mine)
+    weights = load_file(mine / "model.safetensors")
+    save_file({name: 2 * value for name, value in weights.items()}, mine / "model.safetensors")
     with pytest.raises(UserError, match="was trained on forecaster .*mine' .SHA-256 .* but gets '.*mine' .SHA-256"):
         open_world("simple_tag_v3", path, measured)
 
