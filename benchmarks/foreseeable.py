@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from pettingzoo.utils import BaseParallelWrapper
 
 from agents.policy import load_policy
 from envs.parallel import ForecastParallelEnv
-from envs.plans.keeping_on import all_keeping_on
-from envs.simulators.copies import RunningCopy, running_copy
+from envs.plans.keeping_on import CopyableParallelEnv, all_keeping_on
+from envs.simulators.copies import running_copy
 from envs.simulators.interventions import simulator_of
 from predictor.checkpoint import load_checkpoint
 from predictor.online import OnlineForecaster
@@ -69,10 +68,6 @@ class ForeseeableConfig:
         check_out_file(self.out)
 
 
-class _Copyable(RunningCopy, BaseParallelWrapper):
-    """Wrapper whose copies go on exactly."""
-
-
 def generators_of(driver: Any) -> Iterator[np.random.Generator]:
     """Yields the random streams that a driver of `envs.drivers.all_agents` holds."""
     if isinstance(driver, np.random.Generator):
@@ -87,7 +82,7 @@ def generators_of(driver: Any) -> Iterator[np.random.Generator]:
 
 def redrawn(env: ForecastParallelEnv, rng: np.random.Generator) -> Any:
     """Returns a copy of the world inside, with its reader, whose drivers draw other numbers from now on."""
-    world: Any = _Copyable(env.env)
+    world: Any = CopyableParallelEnv(env.env)
     copied, reader = running_copy((world, env.reader), simulator_of(env.env))
     for own in generators_of(copied.env._driver):
         own.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state

@@ -19,7 +19,7 @@ from envs.simulators.interventions import simulator_of
 from predictor.scene import Scene
 
 
-class _Copyable(RunningCopy, BaseParallelWrapper):
+class CopyableParallelEnv(RunningCopy, BaseParallelWrapper):
     """Wrapper whose copies go on exactly."""
 
 
@@ -48,7 +48,7 @@ def all_keeping_on(
     Raises:
         UserError: the environment cannot be copied.
     """
-    copied: Any = _Copyable(env)
+    copied: Any = CopyableParallelEnv(env)
     copied, reader = running_copy((copied, reader), simulator_of(env))
     drive_others = getattr(copied, "drive_others", _nobody)
 

@@ -4,14 +4,18 @@ import functools
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from agents.policy import load_policy
 from benchmarks import foreseeable
-from benchmarks.foreseeable import NAMES, generators_of, redrawn
+from benchmarks.foreseeable import NAMES, generators_of, redrawn, told_of_nearest
 from envs.plans.keeping_on import all_keeping_on
+from predictor.scene import Scene
 
 
 def test_all_random_streams_of_a_driver_are_found():
@@ -33,6 +37,23 @@ def test_copies_draw_anew_and_leave_the_world_as_it_was():
     drawn = [all_keeping_on(copied, reader, *told)[prey] for copied, reader in (redrawn(env, rng) for _ in range(8))]
     assert len({each.tobytes() for each in drawn}) > 1  # the prey's driver draws in most steps
     np.testing.assert_array_equal(all_keeping_on(env.env, env.reader, *told), before)
+
+
+def test_the_path_that_is_told_is_the_predators_and_the_forecast_the_preys():
+    """Plans are of agent 0, so the predator, here 2, stands first; the prey, 1, is then the third."""
+    scene = Scene(np.zeros((3, 4)), np.arange(3), np.ones(3, dtype=bool))
+    asked: list[Any] = []
+
+    def rollout_plans(belief: Any, plan: torch.Tensor) -> Any:
+        asked.append(plan[0, 0])
+        apart = 10.0 * torch.arange(3)[:, None, None]
+        return SimpleNamespace(states=(plan[0, 0] + apart)[None, None, None])
+
+    forecaster: Any = SimpleNamespace(spec=SimpleNamespace(dt_s=0.5), rollout_plans=rollout_plans)
+    online: Any = SimpleNamespace(_beliefs=[None])
+    path = np.array([[1.0, 2.0], [3.0, 2.0]])
+    np.testing.assert_array_equal(told_of_nearest(forecaster, online, scene, 1, path, 2), path + 20.0)
+    np.testing.assert_array_equal(asked[0], [[1.0, 2.0, 2.0, 4.0], [3.0, 2.0, 4.0, 0.0]])
 
 
 @pytest.mark.slow
