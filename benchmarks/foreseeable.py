@@ -2,9 +2,10 @@
 
 `python -m benchmarks.foreseeable` lets trained predators chase. At each step copies of the simulator show where the
 prey goes if every predator repeats its last push, which is what the arm `oracle` shows. A forecast can miss it because
-it does not know the pushes, what the prey's driver draws at random, or how that driver decides. So three forecasts
-stand beside those of a checkpoint and of constant velocity: the checkpoint's with the nearest predator's true path
-given, and two of somebody who knows the driver and its habits, but draws anew.
+it does not know the pushes, what the prey's driver draws at random, this prey's habits, or how any driver decides. So
+other forecasts stand beside those of a checkpoint and of constant velocity: the checkpoint's with the nearest
+predator's true path given, those of somebody who knows the driver and its habits, but draws anew, and those of
+somebody who knows the driver alone and draws the habits, too.
 """
 
 import functools
@@ -18,6 +19,7 @@ import torch
 from jaxtyping import Float
 
 from agents.policy import load_policy
+from envs.drivers.all_agents import Habits
 from envs.parallel import ForecastParallelEnv
 from envs.plans.keeping_on import CopyableParallelEnv, all_keeping_on
 from envs.simulators.copies import running_copy
@@ -44,6 +46,8 @@ NAMES = (
     "the checkpoint, told the nearest predator's path",
     "driver and habits known, one draw",
     "driver and habits known, median of draws",
+    "driver known, habits drawn, one draw",
+    "driver known, habits drawn, median of draws",
 )
 
 
@@ -58,7 +62,7 @@ class ForeseeableConfig:
     episodes: int = 20
     """Number of episodes."""
     draws: int = 12
-    """Number of copies of each step in which the prey's driver draws anew."""
+    """Number of copies of each step in which the prey's driver draws anew, and as many with habits of other prey."""
     out: Path | None = None
     """JSON file to write the result to."""
 
@@ -80,12 +84,32 @@ def generators_of(driver: Any) -> Iterator[np.random.Generator]:
             yield from generators_of(part)
 
 
-def redrawn(env: ForecastParallelEnv, rng: np.random.Generator) -> Any:
-    """Returns a copy of the world inside, with its reader, whose drivers draw other numbers from now on."""
+def with_habits(driver: Any, habits: Habits) -> Any:
+    """Returns the driver of one agent with other habits."""
+    if isinstance(driver, Habits):
+        return habits
+    if isinstance(driver, functools.partial):
+        parts = (with_habits(part, habits) for part in driver.args)
+        keywords = {name: with_habits(part, habits) for name, part in driver.keywords.items()}
+        return functools.partial(with_habits(driver.func, habits), *parts, **keywords)
+    return driver
+
+
+def redrawn(env: ForecastParallelEnv, rng: np.random.Generator, habits: bool = False) -> Any:
+    """Returns a copy of the world inside, with its reader, whose drivers draw other numbers from now on.
+
+    Args:
+        env: the environment, which is not changed.
+        rng: source of the numbers.
+        habits: whether the drivers draw their habits anew, too.
+    """
     world: Any = CopyableParallelEnv(env.env)
     copied, reader = running_copy((world, env.reader), simulator_of(env.env))
     for own in generators_of(copied.env._driver):
         own.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
+    if habits:
+        [drivers] = [part for part in copied.env._driver.args if isinstance(part, dict)]
+        drivers.update({agent: with_habits(driver, Habits.draw(rng)) for agent, driver in drivers.items()})
     return copied.env, reader
 
 
@@ -151,13 +175,19 @@ def measure(config: ForeseeableConfig) -> dict[str, list[float]]:
                 told = scene, observations, last, forecaster.horizon_steps
                 truth = all_keeping_on(env.env, env.reader, *told)
                 again = [redrawn(env, rng) for _ in range(config.draws)]
-                drawn = [all_keeping_on(copied, reader, *told)[prey] for copied, reader in again]
+                others = [redrawn(env, rng, habits=True) for _ in range(config.draws)]
+                drawn, of_others = (
+                    [all_keeping_on(copied, reader, *told)[prey] for copied, reader in copies]
+                    for copies in (again, others)
+                )
                 forecasts = (
                     _straight(scene, prey, forecaster),
                     online.forecast().xy[0, 0, order.tolist().index(prey)].numpy(),
                     told_of_nearest(forecaster, online, scene, prey, truth[hunter], hunter),
                     drawn[0],
                     np.median(drawn, axis=0),
+                    of_others[0],
+                    np.median(of_others, axis=0),
                 )
                 for name, xy_m in zip(NAMES, forecasts, strict=True):
                     found[name].append(float(np.linalg.norm(xy_m - truth[prey], axis=-1).mean()))

@@ -13,7 +13,8 @@ import torch
 
 from agents.policy import load_policy
 from benchmarks import foreseeable
-from benchmarks.foreseeable import NAMES, generators_of, redrawn, told_of_nearest
+from benchmarks.foreseeable import NAMES, generators_of, redrawn, told_of_nearest, with_habits
+from envs.drivers.all_agents import Habits
 from envs.plans.keeping_on import all_keeping_on
 from predictor.scene import Scene
 
@@ -37,6 +38,35 @@ def test_copies_draw_anew_and_leave_the_world_as_it_was():
     drawn = [all_keeping_on(copied, reader, *told)[prey] for copied, reader in (redrawn(env, rng) for _ in range(8))]
     assert len({each.tobytes() for each in drawn}) > 1  # the prey's driver draws in most steps
     np.testing.assert_array_equal(all_keeping_on(env.env, env.reader, *told), before)
+
+
+def habits_in(driver: Any) -> list[Habits]:
+    """Returns the habits that a driver holds, each as often as it stands in it."""
+    if isinstance(driver, functools.partial):
+        return [habits for part in (driver.func, *driver.args, *driver.keywords.values()) for habits in habits_in(part)]
+    if isinstance(driver, dict):
+        return [habits for part in driver.values() for habits in habits_in(part)]
+    return [driver] if isinstance(driver, Habits) else []
+
+
+def test_habits_are_replaced_wherever_a_driver_holds_them_and_nothing_else_is():
+    old, new = (Habits.draw(np.random.default_rng(seed)) for seed in (0, 1))
+    last: list[Any] = [3]
+    driver = functools.partial(print, old, functools.partial(max, 1, key=old), last, sep="-")
+    other = with_habits(driver, new)
+    assert habits_in(other) == [new, new] and habits_in(driver) == [old, old]
+    assert other.func is print and other.args[2] is last and other.keywords == {"sep": "-"}
+
+
+def test_copies_with_other_habits_leave_those_of_the_world():
+    policy, env = load_policy("simple-tag")
+    observations, _ = env.reset(seed=3)
+    env.step(policy(observations))
+    own = habits_in(env.env._driver)
+    drawn = [habits_in(redrawn(env, np.random.default_rng(seed), habits=True)[0]._driver) for seed in (0, 1)]
+    assert own and all(len(of) == len(own) and len(set(of)) == 1 for of in (own, *drawn))  # one agent is driven
+    assert len({own[0], drawn[0][0], drawn[1][0]}) == 3 and habits_in(env.env._driver) == own
+    assert habits_in(redrawn(env, np.random.default_rng(0))[0]._driver) == own
 
 
 def test_the_path_that_is_told_is_the_predators_and_the_forecast_the_preys():
