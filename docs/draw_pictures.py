@@ -165,7 +165,7 @@ BEFORE = {
     "intersection-v2": (7, 9), "simple_tag_v3": (1, 5), "exit-v1": (29, 33), "two-way-v0": (6, 6),
     "merge-generic-v1": (0, 0), "roundabout-generic-v1": (5, 5), "u-turn-v1": (7, 7), "simple_spread_v3": (7, 7),
 }  # fmt: skip
-"""Least and largest share, by step, of the checkpoints without modes in the same episodes [%], from docs/in_env.md."""
+"""Least and largest share, by step, of checkpoints without modes in these episodes [%], docs/checkpoint_history.md."""
 
 
 @rc_context(STYLE)

@@ -20,13 +20,8 @@ from envs.rollouts.cause_run import CauseTask
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import World
-from envs.seeding import Purpose, episode_rng
+from envs.seeding import Purpose
 from predictor.evaluation.pair_trees import pair_features
-
-EVERY = 5
-"""Number of steps from one with labels to the next."""
-FIRST_STEP = 3
-"""First step with labels; forecasters have seen the motion by then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +58,11 @@ def play_graph(task: GraphTask) -> list[EdgeScene]:
     world = task.opened()
     found = checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
     forecasters = {name: SideForecaster(forecaster, world.spec, 1) for name, forecaster in found.items()}
-    first = int(episode_rng(task.seed, Purpose.LABELS).integers(EVERY))
-    scenes = []
+    measured, scenes = task.measured_steps(Purpose.LABELS), []
     for step in range(task.max_steps):
         for forecaster in forecasters.values():
             forecaster.observe(world.perceived())
-        if step >= FIRST_STEP and step % EVERY == first:
+        if step in measured:
             scenes.append(labelled_scene(world, forecasters, task.settings))
         if world.step():
             break

@@ -9,7 +9,13 @@ from envs.rollouts.kept_world import kept_world
 from envs.rollouts.side_forecasts import open_for_checkpoints
 from envs.rollouts.workers import EpisodePool, Result
 from envs.rollouts.world import World, open_to_look
+from envs.seeding import Purpose, episode_rng
 from envs.supervision import TIMEOUT_S
+
+FIRST_STEP = 3
+"""First step that is measured; forecasters have seen the motion by then."""
+EVERY = 5
+"""Number of steps from one at which copies are played to the next, where they are at equal distances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +41,15 @@ class CauseTask:
         world = kept_world(wanted, lambda: open_for_checkpoints(*wanted))
         world.reset(self.seed)
         return world
+
+    def measured_steps(self, purpose: Purpose) -> range:
+        """Returns the steps of the episode, at equal distances from a random one on, that are measured.
+
+        Args:
+            purpose: what is measured; each draws steps of its own.
+        """
+        drawn = int(episode_rng(self.seed, purpose).integers(EVERY))
+        return range(FIRST_STEP + (drawn - FIRST_STEP) % EVERY, self.max_steps, EVERY)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,16 +21,11 @@ from envs.rollouts.moving import moving_agents
 from envs.rollouts.reactions import STRAIGHT
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import EgoWorld, World
-from envs.seeding import Purpose, episode_rng
+from envs.seeding import Purpose
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import has_scale
 from predictor.scene import Forecast, Scene, SceneBatch
 from predictor.support.errors import UserError
-
-EVERY = 5
-"""Number of steps from one at which plans are played to the next."""
-FIRST_STEP = 3
-"""First such step; forecasters have seen the motion by then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +74,11 @@ def play_plans(task: PlanTask) -> list[PlanMoment]:
         )
         for name, forecaster in found.items()
     }
-    first = int(episode_rng(task.seed, Purpose.PLANS).integers(EVERY))
-    moments = []
+    measured, moments = task.measured_steps(Purpose.PLANS), []
     for step in range(task.max_steps):
         for forecaster in forecasters.values():
             forecaster.observe(world.perceived())
-        if step >= FIRST_STEP and step % EVERY == first:
+        if step in measured:
             asked = moment(world, model, forecasters, task.seed, step, task.horizon_steps)
             if asked.whole:
                 moments.append(asked)

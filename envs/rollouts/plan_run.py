@@ -11,9 +11,9 @@ from envs.plans import plan_model_for
 from envs.readers import outcome_keys
 from envs.registry import name_with
 from envs.rollouts.branches import copied
-from envs.rollouts.cause_run import CauseRun
+from envs.rollouts.cause_run import EVERY, FIRST_STEP, CauseRun
 from envs.rollouts.interventions import knows_bodies
-from envs.rollouts.plan_moments import EVERY, FIRST_STEP, PlanMoment, PlanTask, play_plans
+from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_to_look
 from predictor.checkpoint import load_forecaster

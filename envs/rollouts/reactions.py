@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint
-from envs.rollouts.cause_run import CauseTask
+from envs.rollouts.cause_run import FIRST_STEP, CauseTask
 from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
@@ -35,8 +35,6 @@ STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
 """Names of the forecasters that no checkpoint holds."""
 SHARE = 0.15
 """Probability that agents are perturbed at a step."""
-FIRST_STEP = 3
-"""First step at which agents are perturbed; forecasters have seen the motion by then."""
 MOST_BRANCHES = 4
 """Largest number of interventions that are tried for one cell at one step."""
 

@@ -37,7 +37,7 @@ def test_every_picture_is_shown_on_a_page():
 
 
 def test_coverage_without_modes_is_that_of_the_page():
-    page = (Path(__file__).parents[2] / "docs" / "in_env.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "checkpoint_history.md").read_text()
     table = page.split("the checkpoints without modes had (K = 20):")[1].split("\n\n")[1]
     found = {}
     for line in table.splitlines()[2:]:

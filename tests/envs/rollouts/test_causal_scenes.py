@@ -9,7 +9,8 @@ import torch
 
 from envs.rollouts import causal_scenes, side_forecasts
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, causal_labels
-from envs.rollouts.causal_scenes import EVERY, FIRST_STEP, GraphTask, labelled_scene, play_graph
+from envs.rollouts.causal_scenes import GraphTask, labelled_scene, play_graph
+from envs.rollouts.cause_run import EVERY, FIRST_STEP
 from envs.rollouts.side_forecasts import SideForecaster
 from envs.seeding import Purpose, episode_rng
 from predictor.scene import Forecast, Scene

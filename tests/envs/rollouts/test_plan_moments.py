@@ -7,9 +7,10 @@ import pytest
 from highway_env.vehicle.objects import Obstacle
 
 from envs.plans import plan_model_for
-from envs.rollouts import plan_moments
+from envs.rollouts import cause_run, plan_moments
 from envs.rollouts.branches import BranchPoint, copied
-from envs.rollouts.plan_moments import EVERY, FIRST_STEP, STRAIGHT, PlanTask, moment, play_plans
+from envs.rollouts.cause_run import EVERY, FIRST_STEP
+from envs.rollouts.plan_moments import STRAIGHT, PlanTask, moment, play_plans
 from envs.rollouts.side_forecasts import SideForecaster
 from envs.rollouts.world import EgoWorld, open_world
 from envs.seeding import Purpose, episode_rng
@@ -159,7 +160,7 @@ def test_moments_come_at_every_fifth_step_from_a_random_one_on():
 
 def own_moments(env_id: str, driver: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Steps of the moments of an episode of seed 8 with a horizon of four steps, each step one if it counts."""
-    monkeypatch.setattr(plan_moments, "EVERY", 1)
+    monkeypatch.setattr(cause_run, "EVERY", 1)
     return [found.step for found in play_plans(plan_task(OWN + env_id, driver, 8, 30, 4))]
 
 

@@ -11,6 +11,7 @@ import torch
 from envs.rollouts import branches as rollout_branches
 from envs.rollouts import reactions
 from envs.rollouts.branches import Branch, Branches, BranchPoint
+from envs.rollouts.cause_run import FIRST_STEP
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import SideForecaster, open_for_checkpoints
@@ -336,7 +337,7 @@ def test_an_episode_is_a_function_of_its_seed_and_cells_are_independent(
     assert_equal(play_reactions(task(TAG, (checkpoint,))), found)
     only = play_reactions(task(TAG, (checkpoint,), cells=(NEAR_CELL.name,)))
     assert_equal(only, [one for one in found if one.cell == NEAR_CELL.name])
-    assert all(one.step >= reactions.FIRST_STEP and one.seed == 900_000 and one.swerved is None for one in found)
+    assert all(one.step >= FIRST_STEP and one.seed == 900_000 and one.swerved is None for one in found)
 
 
 @pytest.mark.parametrize("kind", ["lstm", "dnri"])
