@@ -22,7 +22,7 @@ from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.forecaster_checks import check_empty, check_futures, check_observed, check_scale
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise, check_noise
-from predictor.scene import PADDING_ID, Forecast, SceneBatch
+from predictor.scene import LARGEST, PADDING_ID, Forecast, SceneBatch
 from predictor.scene_checks import (
     check_batch,
     check_ids,
@@ -179,7 +179,7 @@ class OnlineForecaster:
         Raises:
             ProtocolError: nothing was observed yet.
             UserError: steps or samples are no whole numbers from 1 on; another kind of generator; the spec has no ego,
-                the ego is absent, or the plans are of another shape or not finite.
+                the ego is absent, or the plans are of another shape, not finite or too large.
         """
         use_one_thread_after_fork()
         with torch.inference_mode():
@@ -279,9 +279,9 @@ class OnlineForecaster:
             plans = np.array(ego_plan, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise UserError(f"ego_plan must be numbers: {error}") from error
-        finite = bool(np.isfinite(plans).all())
+        within = bool((np.abs(plans) <= LARGEST).all())
         there = torch.cat([belief.valid[:, 0] for belief in self._beliefs])
-        check_plans(self.forecaster.spec, there, plans.shape, finite, horizon_steps)
+        check_plans(self.forecaster.spec, there, plans.shape, within, horizon_steps)
         plans[..., : self._origins.shape[-1]] -= self._origins[:, None, None]
         return torch.from_numpy(plans.astype(np.float32)).to(self.device)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from predictor.forecaster import Belief, Forecaster, Futures
 from predictor.forecaster_checks import check_futures
 from predictor.noise import Noise
-from predictor.scene import SceneSpec
+from predictor.scene import LARGEST, SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -66,10 +66,11 @@ def rollout_plans(
         Futures with an axis of plans after the batch.
 
     Raises:
-        UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite; what the
-            forecaster returns has other sizes.
+        UserError: the spec has no ego, the ego is absent, or the plans are of another shape, not finite or too
+            large; what the forecaster returns has other sizes.
     """
-    check_plans(forecaster.spec, belief.valid[:, 0], tuple(plans.shape), bool(plans.isfinite().all()), plans.shape[-2])
+    within = bool((plans.abs() <= LARGEST).all())
+    check_plans(forecaster.spec, belief.valid[:, 0], tuple(plans.shape), within, plans.shape[-2])
     kept = [forecaster.spec.feature_names.index(name) for name in forecaster.spec.constant_features]
     if kept:
         plans = plans.clone()
@@ -100,7 +101,7 @@ def check_plans(
     spec: SceneSpec,
     ego_valid: Bool[Tensor, " batch"] | Bool[np.ndarray, " batch"],
     shape: tuple[int, ...],
-    finite: bool,
+    within: bool,
     horizon_steps: int,
 ) -> None:
     """Raises unless plans fit the scenes.
@@ -109,11 +110,11 @@ def check_plans(
         spec: layout of the scenes.
         ego_valid: in which scenes the ego is present.
         shape: shape of the plans.
-        finite: whether all numbers of the plans are finite.
+        within: whether all numbers of the plans are finite and at most `LARGEST` in size.
         horizon_steps: number of steps of the forecast.
 
     Raises:
-        UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite.
+        UserError: the spec has no ego, the ego is absent, or the plans are of another shape, not finite or too large.
     """
     if not spec.has_ego:
         raise UserError("a plan needs an ego, but the scenes have none (has_ego=False); forecast without ego_plan")
@@ -123,8 +124,10 @@ def check_plans(
             f"ego_plan needs the shape (scenes, plans, steps, features) = ({wanted[0]}, at least 1, {wanted[1]}, "
             f"{wanted[2]}), got {shape}"
         )
-    if not finite:
-        raise UserError("ego_plan must be finite, got NaN or infinity")
+    if not within:
+        raise UserError(
+            f"ego_plan must be finite and at most {LARGEST:g} in size, got NaN, infinity or a larger number"
+        )
     if not bool(ego_valid.all()):
         absent = [scene for scene, there in enumerate(ego_valid.tolist()) if not there]
         raise UserError(f"a plan needs the ego in the scene, but it is absent in scene {absent[0]}")

@@ -3,10 +3,8 @@
 import numpy as np
 from jaxtyping import Bool
 
+from predictor.evaluation.outcomes import LANDMARK
 from predictor.scene import Scene, SceneSpec
-
-LANDMARK = "landmark"
-"""Feature that marks agents that never move."""
 
 
 def moving_agents(scene: Scene, spec: SceneSpec) -> Bool[np.ndarray, " agents"]:

@@ -1,4 +1,7 @@
-"""Fits the stochastic controls to training data: constant velocity with noise, and a forecast with Gaussian noise."""
+"""Fits the stochastic controls to training data: constant velocity with noise, and a forecast with Gaussian noise.
+
+Landmarks are left out: they never move, and their errors of 0 would make the noise of all others too small.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +38,7 @@ def fit_noise(
     """Fits the two parameters of constant velocity with noise; see `fit_residual`."""
     straight = ConstantVelocity(windows.spec, horizon_steps)
     outcomes = run_windows(straight, windows, _drawn(windows, seed, most_windows), horizon_steps)
-    return NoisyConstantVelocity.fit(windows.spec, fitted_std_m(outcomes))
+    return NoisyConstantVelocity.fit(windows.spec, fitted_std_m(o.without_landmarks() for o in outcomes))
 
 
 def fit_residual(
@@ -60,7 +63,7 @@ def fit_residual(
     """
     errors, drawn = [], _drawn(windows, seed, most_windows)
     for outcome in run_windows(forecaster, windows, drawn, horizon_steps, batch_size=batch_size, device=device):
-        whole = outcome.valid.all(-1)
+        whole = outcome.without_landmarks().valid.all(-1)
         errors.append((outcome.future - outcome.forecast[:, 0])[whole].cpu().numpy())
     return GaussianResidual.fit(forecaster, np.concatenate(errors))
 

@@ -21,6 +21,8 @@ from predictor.noise import Noise
 
 CARRIED = "is_ball"
 """Feature of an agent that others carry."""
+LANDMARK = "landmark"
+"""Feature of an agent that never moves."""
 MOST_PAIRS = 1_000_000
 """Largest number of pairs of agents, over windows and samples, in one forward."""
 
@@ -51,6 +53,8 @@ class Outcome:
     """Standard deviation around each sample [m]; None if the forecaster has no such estimate."""
     carried: Bool[Tensor, "batch agents"] | None = None
     """Which agents others carry (`CARRIED`): who holds them does not overlap with them. None where nothing can be."""
+    landmarks: Bool[Tensor, "batch agents"] | None = None
+    """Which agents never move (`LANDMARK`). None where there can be none."""
     episode: Int[np.ndarray, " batch"] | None = None
     """Number of each window's episode; None where it is not known."""
 
@@ -62,6 +66,10 @@ class Outcome:
             mode_probs=None,
             scale=None if self.scale is None else self.scale[:, :1],
         )
+
+    def without_landmarks(self) -> "Outcome":
+        """Returns the same with landmarks not counted."""
+        return self if self.landmarks is None else replace(self, valid=self.valid & ~self.landmarks[..., None])
 
     def last_windows(self, count: int) -> "Outcome":
         """Returns the last windows of the batch; all, if there are fewer."""
@@ -233,14 +241,20 @@ def _free_run(
     steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=window.device)
     truth = batch.states[window[:, None], steps].transpose(1, 2)[..., :axes]
     valid = batch.valid[window[:, None], steps].transpose(1, 2) & belief.valid[..., None]
-    now, names = (window, batch.last_observed), forecaster.spec.feature_names
+    now = (window, batch.last_observed)
+
+    def marked(feature: str) -> Tensor | None:
+        names = forecaster.spec.feature_names
+        return batch.states[now][..., names.index(feature)] > 0.5 if feature in names else None
+
     outcome = Outcome(
         futures.states[..., :axes],
         truth,
         _without_ego(forecaster, valid),
         mode_probs=futures.mode_probs,
         scale=futures.scale,
-        carried=batch.states[now][..., names.index(CARRIED)] > 0.5 if CARRIED in names else None,
+        carried=marked(CARRIED),
+        landmarks=marked(LANDMARK),
     )
     if not keep_beliefs:
         return outcome

@@ -342,7 +342,8 @@ def test_agent_0_is_replaced():
         (np.zeros((2, 2, HORIZON, 4)), "ego_plan needs the shape"),
         (np.zeros((2, HORIZON, 4)), "ego_plan needs the shape"),
         (np.zeros((1, 2, HORIZON, 2)), "ego_plan needs the shape"),
-        (np.full((1, 2, HORIZON, 4), np.nan), "ego_plan must be finite, got NaN or infinity"),
+        (np.full((1, 2, HORIZON, 4), np.nan), r"ego_plan must be finite and at most 1e\+30 in size, got NaN"),
+        (np.full((1, 2, HORIZON, 4), 1e200), r"ego_plan must be finite and at most 1e\+30 in size, got NaN"),
     ],
 )
 @pytest.mark.parametrize("kind", ["dgvae", "constant-velocity"])

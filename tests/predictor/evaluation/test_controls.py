@@ -1,5 +1,6 @@
 """Controls fitted to recorded data: from random walks, whose errors are known, to the parameters that made them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,22 @@ def test_the_ego_is_not_fitted(tmp_path: Path):
         episode.states[:, 0, :2] *= 100
     windows = training_windows([store(tmp_path / "ego", episodes, around)], around, HORIZON)
     found = covariance(fit_residual(ConstantVelocity(around, HORIZON), windows, HORIZON))
+    torch.testing.assert_close(found, STEP_M**2 * EXPECTED, rtol=0.15, atol=0.06)
+    assert fit_noise(windows, HORIZON).noise_m == pytest.approx(STEP_M, rel=0.1)
+
+
+def test_landmarks_are_not_fitted(tmp_path: Path):
+    """They never move; here half of the agents are such."""
+    names = (*LAYOUT.feature_names, "landmark")
+    layout = replace(LAYOUT, feature_names=names, feature_scales=(*LAYOUT.feature_scales, 1.0))
+    episodes = []
+    for i in range(120):
+        moving = walk(i, agents=8)
+        states = np.concatenate([moving.states, np.zeros((14, 8, 1), dtype=np.float32)], axis=-1)
+        states[:, 4:, :2], states[:, 4:, 4] = 3.0, 1.0
+        episodes.append(replace(moving, states=states))
+    windows = training_windows([store(tmp_path / "tag", episodes, layout)], layout, HORIZON)
+    found = covariance(fit_residual(ConstantVelocity(layout, HORIZON), windows, HORIZON))
     torch.testing.assert_close(found, STEP_M**2 * EXPECTED, rtol=0.15, atol=0.06)
     assert fit_noise(windows, HORIZON).noise_m == pytest.approx(STEP_M, rel=0.1)
 
