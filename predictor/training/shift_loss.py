@@ -22,6 +22,8 @@ from predictor.support.runtime import precision
 from predictor.training.config import TrainConfig
 from predictor.training.mode_loss import unit
 
+MOVED_AT_STEP = MOVED / 2
+"""Shift from which on an agent counts as moved at a step; less than of a pair, since shifts grow over the horizon."""
 LARGE = 0.03
 """Error, in units of the position's scale, from which on the loss grows linearly: the mean is learned, few large shifts
 (a lane change) do not decide alone."""
@@ -105,7 +107,7 @@ def shift_loss(
     steps = branches.rollout.shape[2]
     counted = pairs.counted[..., :steps, None]
     true = pairs.true_shift(axes)[..., :steps, :] / scales[:axes]
-    moved = (true.norm(dim=-1) > MOVED / 2).sum().clamp(min=1)
+    moved = (true.norm(dim=-1) > MOVED_AT_STEP).sum().clamp(min=1)
     forecasts = [(branches.rollout, twins.rollout)]
     if branches.modes is not None and twins.modes is not None and branches.modes.states.shape[1] > 1:
         forecasts.append((_mean(branches), _mean(twins)))
