@@ -75,10 +75,11 @@ def evaluate_policy_on_seeds(
         drivers: names of drivers that are compared beside the arena's baselines ("planner").
 
     Raises:
-        UserError: fewer than one episode.
+        UserError: fewer than one episode, or fewer than one environment.
     """
-    if num_episodes < 1:
-        raise UserError(f"num_episodes must be at least 1, got {num_episodes}")
+    for what, number in (("num_episodes", num_episodes), ("num_envs", num_envs)):
+        if number < 1:
+            raise UserError(f"{what} must be at least 1, got {number}")
     seeds = range(first_seed, first_seed + num_episodes)
     arena = open_arena(task, min(num_envs, num_episodes))
     try:

@@ -28,12 +28,7 @@ def settings_from_table(algorithm: Algorithm, table: Mapping[str, Any], where: s
     Raises:
         UserError: a name is unknown, or a value has another type.
     """
-    kind = type(PRESETS[algorithm])
-    known, hints = [field.name for field in fields(kind)], get_type_hints(kind)
-    for name in table:
-        if name not in known:
-            raise UserError(f"{where}: {algorithm} has no hyperparameter '{name}'; there are {', '.join(known)}")
-    return {name: converted(value, hints[name], f"{where}: {name}") for name, value in table.items()}
+    return _typed(type(PRESETS[algorithm]), table, f"{where}: {algorithm}", where)
 
 
 def settings_from_file(algorithm: Algorithm, path: Path) -> dict[str, Any]:
@@ -73,10 +68,10 @@ def changed(preset: Preset, settings: Mapping[str, Any], where: str) -> Preset:
     """Returns a preset with other values.
 
     Raises:
-        UserError: a value is out of range; the message begins with `where`.
+        UserError: a name is unknown, or a value is of another type or out of range; the message begins with `where`.
     """
     try:
-        return replace(preset, **settings)
+        return replace(preset, **_typed(type(preset), settings, where, where))
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
 
@@ -92,6 +87,15 @@ def write_preset(path: Path, preset: Preset, comments: Sequence[str] = ()) -> No
     values = {name: value for name, value in asdict(preset).items() if value is not None}  # TOML has no None
     lines = [f"# {line}" for line in comments] + [f"{name} = {_text(value)}" for name, value in values.items()]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _typed(kind: type[Preset], table: Mapping[str, Any], of: str, where: str) -> dict[str, Any]:
+    """Returns hyperparameters of a kind of preset, converted to its types."""
+    known, hints = [field.name for field in fields(kind)], get_type_hints(kind)
+    for name in table:
+        if name not in known:
+            raise UserError(f"{of} has no hyperparameter '{name}'; there are {', '.join(known)}")
+    return {name: converted(value, hints[name], f"{where}: {name}") for name, value in table.items()}
 
 
 def _value(text: str, is_array: bool) -> Any:

@@ -6,13 +6,20 @@ where a value differs, the field says why. `agents.preset_settings` changes them
 """
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from agents.task import Backend
 from envs.readers.mpe import MPE_IDS
 from envs.registry import is_foreign_id, is_multiagent_id
 from envs.sb3.algorithms import Algorithm
-from predictor.support.config_checks import MOST_WIDTH, check_at_least, check_at_most, check_choices, check_positive
+from predictor.support.config_checks import (
+    MOST_WIDTH,
+    check_at_least,
+    check_at_most,
+    check_choice,
+    check_choices,
+    check_positive,
+)
 from predictor.support.errors import UserError
 from predictor.support.memory import check_memory
 
@@ -255,7 +262,13 @@ _PARTICLES = PPOPreset(
 
 
 def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
-    """Returns the preset of an algorithm that fits an env id and a backend."""
+    """Returns the preset of an algorithm that fits an env id and a backend.
+
+    Raises:
+        UserError: there is no such algorithm, or no such backend.
+    """
+    check_choice("algorithm", algorithm, tuple(PRESETS))
+    check_choice("backend", backend, get_args(Backend))
     preset = PRESETS[algorithm]
     if isinstance(preset, PPOPreset):
         if is_multiagent_id(env_id):

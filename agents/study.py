@@ -6,13 +6,16 @@ never runs a finished cell again. The folder then holds report.html, report.md, 
 """
 
 import itertools
+import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any, cast
 
 from agents.episode_file import has_pyarrow
+from agents.presets import preset_for
 from agents.results import PACKAGES
 from agents.studies.cells import Cell, cells_of
 from agents.studies.findings import Findings
@@ -21,7 +24,9 @@ from agents.studies.pool import run_cells
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
 from agents.studies.results import RESULT_FILE, Result, read_result, write_tables
+from agents.task import Task
 from envs.registry import envpool_task_of
+from envs.sb3.algorithms import Algorithm
 from envs.simulators.envpool import begins_alike
 from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import parse
@@ -236,7 +241,22 @@ def _has_settings_of(result: Result, study: Study) -> bool:
     arm = next((arm for arm in study.arms if arm.name == result.arm), None)
     if result.settings is None or (arm is None and result.algorithm is not None):  # an arm that is gone
         return True
-    return result.settings == study.settings_of(scenario, None if result.algorithm is None else arm, result.algorithm)
+    wanted = study.settings_of(scenario, None if result.algorithm is None else arm, result.algorithm)
+    return _meaning(result.settings, scenario.env_id, result.algorithm) == _meaning(
+        wanted, scenario.env_id, result.algorithm
+    )
+
+
+def _meaning(said: Mapping[str, Any], env_id: str, algorithm: str | None) -> dict[str, Any]:
+    """Returns what a file says of a result without what changes none: the device, and values that are the defaults."""
+    options = {**said.get("scenario", {}), **said.get("arm", {})}
+    usual = {field.name: field.default for field in fields(Task)}
+    backend = options.get("backend", "gymnasium")
+    preset = {} if algorithm is None else asdict(preset_for(env_id, cast(Algorithm, algorithm), backend))
+    usual, preset = json.loads(json.dumps([usual, preset], default=str))
+    named = {k: v for k, v in options.items() if k != "device" and (k not in usual or v != usual[k])}
+    changes = {key: value for key, value in said.get("settings", {}).items() if value != preset.get(key)}
+    return {**said, "scenario": named, "arm": {}, "settings": changes}
 
 
 def _run_missing(

@@ -32,11 +32,11 @@ from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.supervision import TIMEOUT_S
 from envs.wrappers import ForecastObservation
-from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, weights_stamp
 from predictor.forecaster import Forecaster
 from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
-from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices, check_positive
+from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_fields, check_positive
 from predictor.support.errors import UserError, short
 from predictor.support.memory import check_count
 from predictor.support.remote import is_remote
@@ -110,7 +110,7 @@ class Task:
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
-        check_choices(self)
+        check_fields(self)
         if self.is_multiagent and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
         if self.learners:
@@ -231,7 +231,9 @@ class Task:
         """Forecaster whose sizes the observation has; None for those of the one that is shown."""
         if self.observe == "forecast" and self.sizes_of in (None, self.checkpoint or entry_for(self.env_id).checkpoint):
             return None
-        return _shipped_for(self.env_id) if self.sizes_of is None else _loaded(self.sizes_of)
+        return (
+            _shipped_for(self.env_id) if self.sizes_of is None else _loaded(self.sizes_of, weights_stamp(self.sizes_of))
+        )
 
     def make(self, **kwargs: Any) -> Any:
         """Makes the environment, without forecasts.
@@ -382,11 +384,11 @@ def _texts_of(content: Any) -> Iterator[str]:
 def _shipped_for(env_id: str) -> Forecaster | None:
     """Returns the forecaster that ships for an id; None if none does."""
     name = entry_for(env_id).checkpoint
-    return None if name is None else _loaded(name)
+    return None if name is None else _loaded(name, weights_stamp(name))
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(name: str) -> Forecaster:
+def _loaded(name: str, stamp: tuple[int, int]) -> Forecaster:
     """Returns the forecaster of a checkpoint."""
     forecaster: Forecaster = load_checkpoint(name)[0]
     return forecaster

@@ -35,7 +35,7 @@ from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
 from envs.sb3.policy_file import PolicyNote, check_whole, read_note, selection_return
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import check_at_least, check_fields
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file, write_json
 from predictor.support.runtime import resolve_device
@@ -78,7 +78,7 @@ class TrainingPlan:
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
-        check_choices(self)
+        check_fields(self)
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "selection_envs", "checkpoint_every"
         )

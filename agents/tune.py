@@ -219,12 +219,8 @@ def _run_trial(config: TuneConfig, study: "Study", index: int, preset: Preset) -
         value = None
     state = optuna.trial.TrialState.PRUNED if value is None else optuna.trial.TrialState.COMPLETE
     if trial is None:
-        noted = {"settings": settings}
-        study.add_trial(
-            optuna.create_trial(state=state, params=settings, distributions=space, value=value, user_attrs=noted)
-        )
+        study.add_trial(optuna.create_trial(state=state, params=settings, distributions=space, value=value))
     else:
-        trial.set_user_attr("settings", settings)
         study.tell(trial, value, state)
     shown = ", ".join(f"{name}={number:.4g}" for name, number in settings.items())
     result = "diverged" if value is None else f"return {value:.3f}"
@@ -273,7 +269,7 @@ def _write_best(config: TuneConfig, study: "Study", preset: Preset) -> None:
         f"python -m agents.tune: {config.algorithm} on {config.env_id}, arm {ARM}, {config.steps} steps",
         f"trial {index + 1}, the best of {len(ended)}: mean return {value:.3f} in {measured_in}",
     )
-    best = changed(preset, ended[index].user_attrs["settings"], config.algorithm)
+    best = changed(preset, ended[index].params, config.algorithm)
     write_preset(config.folder / BEST_FILE, best, comments)
 
 

@@ -306,7 +306,8 @@ class SeededEpisodes(gym.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Makes a step and records what the result needs."""
         if self._driver is not None:
-            action = self._driver(without_added(self._obs))
+            with named(scene_source(self.env), f"seed {self._last}, step {len(self._rewards) + 1}"):
+                action = self._driver(without_added(self._obs))
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._obs = obs
         self._rewards.append(float(reward))

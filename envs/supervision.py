@@ -133,7 +133,7 @@ class SupervisedEnv(gym.Wrapper):
 
 
 @contextmanager
-def named(env_id: str, place: Place) -> Iterator[None]:
+def named(env_id: str, place: Place | str) -> Iterator[None]:
     """Turns what an environment raises inside the block into one sentence with its id and place.
 
     Raises:

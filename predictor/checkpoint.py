@@ -146,6 +146,18 @@ def resolve(name: str | Path) -> Path:
     )
 
 
+def weights_stamp(name: str | Path) -> tuple[int, int]:
+    """Returns time [ns] and size of a checkpoint's file of weights; zeros of what has no such file.
+
+    What is kept of a checkpoint is kept with its stamp, and not used any more when the folder's weights are replaced.
+    """
+    try:
+        found = os.stat(resolve(name) / WEIGHTS)
+    except (OSError, UserError):
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
 @functools.lru_cache(maxsize=64)
 def _fetched(name: str) -> Path:
     return fetch(name, {CONFIG: MOST_CONFIG_BYTES, WEIGHTS: MOST_WEIGHT_BYTES}, {CARD: MOST_CARD_BYTES})

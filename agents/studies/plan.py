@@ -376,7 +376,7 @@ def _task_options(table: Mapping[str, Any], where: str, others: Sequence[str] = 
     texts = dict(table)
     if isinstance(texts.get("env_kwargs"), dict):
         try:
-            texts["env_kwargs"] = json.dumps(texts["env_kwargs"])
+            texts["env_kwargs"] = json.dumps(texts["env_kwargs"], sort_keys=True) if texts["env_kwargs"] else ""
         except TypeError as error:
             raise UserError(f"{where}: env_kwargs must hold what JSON has (no dates or times): {error}") from error
     return {key: converted(value, hints[key], f"{where}: {key}") for key, value in texts.items()}

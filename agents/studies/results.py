@@ -82,7 +82,7 @@ def read_result(path: Path, advice: str = MEASURED_ANEW) -> Result:
 def write_tables(folder: Path, results: Sequence[Result]) -> None:
     """Writes a line per test episode and a line per measurement in training, of all results, as Parquet."""
     _write_parquet(folder / EPISODES_FILE, [_labels(r) | _columns(e) for r in results for e in r.episodes])
-    curves = [_labels(r) | {k: v for k, v in point.items()} for r in results for point in r.curve]
+    curves = [_labels(r) | point for r in results for point in r.curve]
     _write_parquet(folder / CURVES_FILE, curves)
 
 

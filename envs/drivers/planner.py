@@ -27,7 +27,7 @@ from envs.readers import reader_for
 from envs.readers.base import SceneReader, bounded_spec, perceive, show
 from envs.registry import entry_for
 from envs.wrappers import SceneObservation, scene_source
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, weights_stamp
 from predictor.forecaster import Forecaster, has_scale
 from predictor.forecaster_checks import require_forecaster
 from predictor.online import OnlineForecaster
@@ -130,11 +130,11 @@ def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:
             f"no checkpoint ships for env '{source}': name the planner's forecaster, as planner:CHECKPOINT (a name or "
             f"a path) or planner:{CONSTANT_VELOCITY}"
         )
-    return _loaded(checkpoint, spec, source)
+    return _loaded(checkpoint, spec, source, weights_stamp(checkpoint))
 
 
 @functools.lru_cache(maxsize=4)
-def _loaded(checkpoint: str, spec: Any, source: str) -> Forecaster:
+def _loaded(checkpoint: str, spec: Any, source: str, stamp: tuple[int, int]) -> Forecaster:
     return load_forecaster(checkpoint, spec, f"env '{source}'")
 
 

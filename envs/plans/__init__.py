@@ -12,7 +12,7 @@ from envs.plans.base import PlanModel, Plans, checked_model, checked_plans
 from envs.plans.highway import HighwayPlans
 from envs.readers.base import check_registration
 from envs.readers.highway import is_highway_env
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, reason_of
 
 __all__ = [
     "HighwayPlans",
@@ -48,7 +48,8 @@ def plan_model_for(env: gym.Env) -> PlanModel:
     """Returns the plan model of an environment: the one registered for its class, or highway-env's.
 
     Raises:
-        UserError: there is none for the environment or its actions, or a wrapper changes its actions.
+        UserError: there is none for the environment or its actions, a wrapper changes its actions, or the registered
+            one cannot be made.
     """
     inside: gym.Env = env
     while isinstance(inside, gym.Wrapper):
@@ -61,7 +62,13 @@ def plan_model_for(env: gym.Env) -> PlanModel:
         inside = inside.env
     for kind in type(env.unwrapped).__mro__:
         if kind in _REGISTERED:
-            return checked_model(_REGISTERED[kind](env))
+            try:
+                made = _REGISTERED[kind](env)
+            except UserError:
+                raise
+            except Exception as error:
+                raise UserError(f"the plan model registered for {kind.__name__} failed: {reason_of(error)}") from error
+            return checked_model(made)
     if is_highway_env(env):
         return HighwayPlans(env)
     raise UserError(

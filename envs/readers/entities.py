@@ -65,6 +65,12 @@ class EntityRowsReader:
                 f"EntityRowsReader needs each of the columns {', '.join(needed)} once, got {self.columns}; "
                 "name columns of no interest ''"
             )
+        known = {*needed, "presence", "id", "heading", "cos_h", "sin_h"}
+        if unknown := [name for name in named if name not in known]:
+            raise UserError(
+                f"EntityRowsReader knows no column '{unknown[0]}'; there are {', '.join(sorted(known))}; name "
+                "columns of no interest ''"
+            )
         if ("cos_h" in named) != ("sin_h" in named) or {"heading", "cos_h"} <= set(named):
             raise UserError(f"the heading is one column 'heading', or 'cos_h' and 'sin_h', got {self.columns}")
         scales = self.scales

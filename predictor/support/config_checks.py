@@ -72,6 +72,16 @@ def check_types(config: Any) -> None:
             raise UserError(f"{name} must be {wanted}, got {short(repr(value), 60)}")
 
 
+def check_fields(config: Any) -> None:
+    """Checks types (`check_types`) and choices (`check_choices`) of a config's fields.
+
+    Raises:
+        UserError: a field has another type, or a value that is no choice of it.
+    """
+    check_types(config)
+    check_choices(config)
+
+
 def make_plain(config: Any) -> None:
     """Turns lists and arrays among the fields of a config into tuples, NumPy's numbers into Python's, as in JSON."""
     for field in fields(config):

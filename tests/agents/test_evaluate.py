@@ -31,6 +31,8 @@ def test_all_policies_play_the_same_held_out_seeds():
 def test_no_episodes_are_refused():
     with pytest.raises(UserError, match="num_episodes must be at least 1, got 0"):
         evaluate_policy_on_seeds(Task(TOY, "none"), "idle", "idle", 0)
+    with pytest.raises(UserError, match="num_envs must be at least 1, got 0"):
+        evaluate_policy_on_seeds(Task(TOY, "none"), "idle", "idle", 1, num_envs=0)
 
 
 @pytest.mark.slow

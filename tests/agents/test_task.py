@@ -219,6 +219,20 @@ def test_perception_limits_what_is_seen(env_id: str, observe: Any):
     assert seen[0] > seen[1]
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("what_if", "no", "what_if must be true or false, got 'no'"),
+        ("num_samples", 1.5, "num_samples must be a whole number, got 1.5"),
+        ("num_samples", "3", "num_samples must be a whole number, got '3'"),
+        ("env_kwargs", {"config": {}}, "env_kwargs must be a text, got {'config': {}}"),
+    ],
+)
+def test_values_of_other_types_are_refused(field: str, value: Any, message: str):
+    with pytest.raises(UserError, match=f"^{message}$"):
+        Task("merge-v1", **{field: value})
+
+
 def test_perception_must_be_positive_and_have_an_effect():
     with pytest.raises(UserError, match="perception_m must be positive, got -1"):
         Task("merge-v1", perception_m=-1.0)

@@ -131,6 +131,27 @@ def test_a_policy_is_measured_as_often_as_it_is_said(
     assert measured == expected
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": "0"}, "seed must be a whole number, got '0'"),
+        ({"steps": 1.5}, "steps must be a whole number, got 1.5"),
+        ({"settings": {"nosuch": 1}}, "ppo has no hyperparameter 'nosuch'; there are learning_rate, gamma"),
+        ({"settings": {"gamma": "x"}}, "ppo: gamma must be a number, got 'x'"),
+    ],
+)
+def test_values_of_other_types_are_refused(changes: dict[str, Any], message: str):
+    with pytest.raises(UserError, match=message):
+        plan(**changes)
+
+
+def test_presets_of_what_there_is_not_are_refused():
+    with pytest.raises(UserError, match="algorithm must be one of ppo, .*, got 'nosuch'"):
+        preset_for("merge-v1", "nosuch")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="backend must be one of gymnasium, envpool, got 'nosuch'"):
+        preset_for("merge-v1", "ppo", "nosuch")  # type: ignore[arg-type]
+
+
 def test_steps_that_teach_nothing_are_refused():
     with pytest.raises(
         UserError, match=r"dqn makes its first update after learning_starts=200 steps, so 200 steps teach"

@@ -50,10 +50,10 @@ def study_of(folder: Path) -> optuna.Study:
     return open_study(folder / "tuning.db")
 
 
-def ended(folder: Path) -> list[tuple[Any, Any, Any]]:
-    """Returns parameters, settings and value of the trials that ended."""
+def ended(folder: Path) -> list[tuple[Any, Any]]:
+    """Returns parameters and value of the trials that ended."""
     trials = [trial for trial in study_of(folder).get_trials() if trial.state == optuna.trial.TrialState.COMPLETE]
-    return [(trial.params, trial.user_attrs["settings"], trial.value) for trial in trials]
+    return [(trial.params, trial.value) for trial in trials]
 
 
 def test_optuna_says_nothing_of_its_own(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -72,14 +72,14 @@ def test_the_best_trial_is_written_for_train_policy(tmp_path: Path, capsys: pyte
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(":")[0] for line in lines] == ["trial 1 of 2", "trial 2 of 2"]
     assert "learning_rate=0.0005" in lines[0] and "gamma=0.8" in lines[0]
-    (first, _, one), (second, settings, other) = ended(tmp_path / "tuned")
+    (first, one), (second, other) = ended(tmp_path / "tuned")
     assert (first["learning_rate"], first["gamma"], first["n_steps"]) == (5e-4, 0.8, 8), "the preset itself"
     assert second["learning_rate"] != 5e-4
     found = settings_from_file("ppo", best)
     assert found["net_arch"] == (256, 256) and set(found) == {*PPOPreset.__dataclass_fields__} - {"target_kl"}, (
         "all that is set"
     )
-    expected = settings if other > one else first
+    expected = second if other > one else first
     assert found["learning_rate"] == expected["learning_rate"] and found["gamma"] == expected["gamma"]
     assert f"mean return {max(one, other):.3f} in 1 x 2 episodes" in best.read_text()
     assert f"return {other:.3f}" in lines[1]
@@ -304,7 +304,7 @@ def test_any_folder_may_hold_a_tuning(tmp_path: Path):
 def test_of_equal_trials_the_first_one_is_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = [{"learning_rate": rate} for rate in (1e-4, 2e-4, 3e-4)]
     values = (1.0, 2.0, 2.0)
-    trials = [SimpleNamespace(value=v, user_attrs={"settings": s}) for v, s in zip(values, settings, strict=True)]
+    trials = [SimpleNamespace(value=v, params=s) for v, s in zip(values, settings, strict=True)]
     monkeypatch.setattr(command, "_ended", lambda study: trials)
     (tmp_path / "tuned").mkdir()
     command._write_best(config(tmp_path / "tuned"), None, PPOPreset())  # type: ignore[arg-type]

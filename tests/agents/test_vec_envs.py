@@ -17,6 +17,7 @@ from envs.registry import make_env
 from envs.rollouts.driving_measures import recorder_for
 from envs.sb3 import envpool as envpool_module
 from envs.seeding import driver_rng
+from envs.supervision import EnvironmentFailedError
 from envs.wrappers import SceneObservation
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
@@ -212,6 +213,13 @@ def test_random_ego_depends_on_the_seed_alone(num_envs: int):
 
 def test_idle_ego_ignores_the_actions_that_arrive():
     assert all(e.episode_return == 0 for e in run_episodes(dice_venv(2), "idle", range(4)))
+
+
+def test_what_a_driver_raises_is_told_with_its_place(monkeypatch: pytest.MonkeyPatch):
+    """As by environments in processes of their own."""
+    monkeypatch.setattr("agents.vec_envs.make_ego_driver", lambda *_: lambda seen: {}["lane"])
+    with pytest.raises(EnvironmentFailedError, match="Dice, seed 5, step 1: KeyError: 'lane'"):
+        run_episodes(VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())])), "idle", [5])
 
 
 def test_one_action_in_every_step_is_a_driver_and_every_step_is_counted():

@@ -21,7 +21,7 @@ import agents.study
 from agents.studies.plan import Scenario, read_study
 from agents.studies.pool import run_cells
 from agents.studies.results import write_result
-from agents.study import StudyConfig, run_study
+from agents.study import StudyConfig, _has_settings_of, run_study
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.jobs import SERVED
 from tests.agents.studies import helpers as studies
@@ -409,6 +409,27 @@ def test_the_report_alone_leaves_out_results_of_other_settings(
     assert [(e["arm"], e["seed"], e["return"]) for e in episodes] == [("random", None, 1.0), ("none", 0, 2.0)]
     assert "left out: 2 results of other settings than corridor's file has now" in capsys.readouterr().err
     assert "Not run yet: 1 training of" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("more", "same"),
+    [
+        ('device = "auto"', True),
+        ('backend = "gymnasium"', True),
+        ("num_samples = 1", True),
+        ("num_samples = 2", False),
+        ("[algorithms.ppo]\ngamma = 0.8", True),
+        ("[algorithms.ppo]\ngamma = 0.7", False),
+    ],
+)
+def test_a_default_that_is_written_down_changes_no_setting(tmp_path: Path, more: str, same: bool):
+    text = 'arms = ["zeros"]\n{}[scenarios.corridor]\nenv_id = "merge-v1"\n{}'
+    before = read_study(study_path(tmp_path, text.format("", "")))
+    table, option = (f"{more}\n", "") if more.startswith("[") else ("", f"{more}\n")
+    now = read_study(study_path(tmp_path, text.format(table, option)))
+    found = studies.result("zeros", [1.0], seed=0, env_id="merge-v1", scenario="corridor")
+    found = replace(found, settings=before.settings_of(before.scenarios[0], before.arms[0], "ppo"))
+    assert _has_settings_of(found, now) is same
 
 
 @pytest.mark.parametrize("other", [{"scenarios": ("corridor",)}, {"seeds": 1}, {"cluster": "auto"}])

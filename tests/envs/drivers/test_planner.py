@@ -1,6 +1,9 @@
 """The planner takes the best plan within its risk, ties and "all too risky" by rule, and drives highway-env."""
 
+import os
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +17,7 @@ from envs.drivers.planner import (
     PlannerConfig,
     choose,
     expected_rewards,
+    forecaster_for,
     is_planner,
     planner_checkpoint,
     planner_config,
@@ -24,7 +28,7 @@ from envs.readers.entities import EntityRowsReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
-from predictor.checkpoint import load_checkpoint
+from predictor.checkpoint import WEIGHTS, load_checkpoint, resolve, weights_stamp
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -262,6 +266,17 @@ def test_a_planner_takes_the_name_of_a_checkpoint():
     env.reset(seed=0)
     by_name, loaded = Planner(env, "highway"), Planner(env, load_checkpoint("highway")[0])
     assert by_name() == loaded() and np.array_equal(by_name.survival, loaded.survival)
+
+
+def test_a_checkpoint_that_was_replaced_is_loaded_anew(tmp_path: Path):
+    shutil.copytree(resolve("highway"), tmp_path / "mine")
+    env, name = make_env("highway-fast-v0"), str(tmp_path / "mine")
+    first = forecaster_for(env, name)
+    assert forecaster_for(env, name) is first
+    shutil.copytree(resolve("merge"), tmp_path / "mine", dirs_exist_ok=True)
+    os.utime(tmp_path / "mine" / WEIGHTS, ns=(1, 1))  # copies keep the time; of another size or not, it is another file
+    assert forecaster_for(env, name) is not first
+    assert weights_stamp("constant-velocity") == (0, 0)
 
 
 def test_in_a_wrapper_the_planner_perceives_no_more_than_its_forecaster_was_trained_with():

@@ -231,6 +231,9 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
     assert isinstance(model, plans_base.PlanModel)
     register_plan_model(Blank, lambda env: model)
     assert plan_model_for(Blank()) is model
+    register_plan_model(Blank, lambda env: env.lanes)  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match="the plan model registered for Blank failed: .*no attribute 'lanes'"):
+        plan_model_for(Blank())
 
 
 @pytest.mark.parametrize(

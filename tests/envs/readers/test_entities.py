@@ -303,6 +303,8 @@ def test_it_can_be_pickled_and_compared():
     [
         ({"columns": ("x", "y", "vx")}, "needs each of the columns x, y, vx, vy once, got .*name columns of no inter"),
         ({"columns": (*COLUMNS, "x")}, "needs each of the columns x, y, vx, vy once"),
+        ({"columns": ("presense", *COLUMNS[1:])}, "knows no column 'presense'; there are .*presence, sin_h, .*'No|''"),
+        ({"columns": (*COLUMNS, "Id")}, "knows no column 'Id'; there are cos_h, heading, id, presence, sin_h, vx, vy,"),
         ({"columns": (*COLUMNS, "cos_h")}, "the heading is one column 'heading', or 'cos_h' and 'sin_h'"),
         ({"columns": (*COLUMNS, "cos_h", "sin_h", "heading")}, "the heading is one column"),
         ({"scales": (1.0,) * 4}, "one number for each of 5 columns, not 0"),
