@@ -115,7 +115,7 @@ def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_confi
     without = LIMITS.split("All have geometry on their edges")[1].split("\n* ")[0]
     named = {name for name in configs if f"`{name}`" in without}
     assert named == {name for name, config in configs.items() if not config.get("geometry_scales")}
-    number = {4: "four", 5: "five"}[len(named)]
+    number = {3: "three", 4: "four"}[len(named)]
     assert f"but for {number} of the {len(configs)}" in " ".join(TRAINING.split())
     for config in configs.values():
         assert not config.get("innovation_rounds") and not config.get("gated_messages")
