@@ -388,7 +388,7 @@ def _shipped_for(env_id: str) -> Forecaster | None:
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(name: str, stamp: tuple[int, int]) -> Forecaster:
+def _loaded(name: str, found: tuple[int, int]) -> Forecaster:
     """Returns the forecaster of a checkpoint."""
     forecaster: Forecaster = load_checkpoint(name)[0]
     return forecaster

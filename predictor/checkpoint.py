@@ -24,7 +24,7 @@ from predictor.scene import SceneSpec
 from predictor.scene_checks import MOST_STEPS
 from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
 from predictor.support.errors import UserError, short
-from predictor.support.files import check_place, new_folder, told_of, write_bytes, write_json
+from predictor.support.files import Stamp, check_place, new_folder, stamp, told_of, write_bytes, write_json
 from predictor.support.hub import fetch, hub_name, is_hub
 from predictor.support.reading import MIB, NoSuchFile, check_regular, read_json, version_of
 from predictor.support.remote import address, is_remote, kept_copy, named
@@ -146,16 +146,12 @@ def resolve(name: str | Path) -> Path:
     )
 
 
-def weights_stamp(name: str | Path) -> tuple[int, int]:
-    """Returns time [ns] and size of a checkpoint's file of weights; zeros of what has no such file.
-
-    What is kept of a checkpoint is kept with its stamp, and not used any more when the folder's weights are replaced.
-    """
+def weights_stamp(name: str | Path) -> Stamp:
+    """Returns the stamp of a checkpoint's file of weights; zeros of a name that has none."""
     try:
-        found = os.stat(resolve(name) / WEIGHTS)
-    except (OSError, UserError):
+        return stamp(resolve(name) / WEIGHTS)
+    except UserError:
         return 0, 0
-    return found.st_mtime_ns, found.st_size
 
 
 @functools.lru_cache(maxsize=64)

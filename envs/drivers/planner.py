@@ -34,6 +34,7 @@ from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch
 from predictor.support.config_checks import check_at_least, check_types
 from predictor.support.errors import UserError
+from predictor.support.files import Stamp
 
 PLANNER = "planner"
 """Name of the driver; `planner:CHECKPOINT` names its forecaster too, `planner@RISK` its bound on the risk, and
@@ -134,7 +135,7 @@ def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:
 
 
 @functools.lru_cache(maxsize=4)
-def _loaded(checkpoint: str, spec: Any, source: str, stamp: tuple[int, int]) -> Forecaster:
+def _loaded(checkpoint: str, spec: Any, source: str, found: Stamp) -> Forecaster:
     return load_forecaster(checkpoint, spec, f"env '{source}'")
 
 

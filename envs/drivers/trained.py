@@ -5,7 +5,6 @@ Learners, the driver of the others and the forecaster are read from the note ins
 """
 
 import functools
-import os
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -22,6 +21,7 @@ from envs.registry import entry_for
 from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
+from predictor.support.files import Stamp, stamp
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -186,15 +186,11 @@ def kept_policy(path: str) -> "BaseAlgorithm":
     Raises:
         UserError: see `envs.sb3.policy_file.load_policy`.
     """
-    try:
-        found = os.stat(path)
-    except OSError:  # which loading it tells
-        return _loaded(path, 0, 0)
-    return _loaded(path, found.st_mtime_ns, found.st_size)
+    return _loaded(path, stamp(path))
 
 
 @functools.lru_cache(maxsize=16)
-def _loaded(path: str, changed_ns: int, size: int) -> "BaseAlgorithm":
+def _loaded(path: str, found: Stamp) -> "BaseAlgorithm":
     from envs.sb3.policy_file import load_policy  # most drivers need no SB3
 
     return load_policy(Path(path))

@@ -23,11 +23,22 @@ import numpy as np
 from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_use, cannot_write, short
 from predictor.support.remote import address, is_remote, require_local, uploaded
 
+Stamp = tuple[int, int]
+"""Time of the last change [ns] and size [bytes] of a file; zeros of one that is not there."""
 _FULL_BYTES = 65_536
 """Free space below which a disk counts as full when a library fails to write without saying why."""
 _CODE = 8
 """Number of digits in the name of an unfinished file."""
 _HERE, _EXCHANGE = -100, 2  # AT_FDCWD of <fcntl.h>, RENAME_EXCHANGE of <linux/fs.h>
+
+
+def stamp(path: str | Path) -> Stamp:
+    """Returns the stamp of a file: what is kept of the file is kept with it, and made anew if the file is replaced."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 import json
 import math
+import os
 import shutil
 import sys
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ from envs.drivers.trained import env_for_driver, parallel_env_for_driver
 from envs.readers import register_reader
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.registry import make_multiagent_env
-from predictor.checkpoint import resolve
+from predictor.checkpoint import WEIGHTS, resolve
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.agents.helpers import LIVES, TOY, Meadow
@@ -176,6 +177,15 @@ def test_every_arm_has_the_sizes_of_the_checkpoint_that_is_named(tmp_path: Path)
         with pytest.raises(UserError, match="edges of 4 types with .* observation room for 2 with .*sizes_of"):
             Task("highway-fast-v0", arm, large, sizes_of="highway").check()
     Task("highway-fast-v0", "no-edges", large, sizes_of="highway").check()  # shows no edges
+
+
+def test_the_sizes_of_a_checkpoint_that_was_replaced_are_read_anew(tmp_path: Path):
+    name = save_tiny(tmp_path / "sizes", HIGHWAY_SPEC, num_edge_types=4)
+    before = Task("highway-fast-v0", "zeros", sizes_of=name)._forecasts()[0]
+    save_tiny(tmp_path / "sizes", HIGHWAY_SPEC, num_edge_types=3)
+    os.utime(tmp_path / "sizes" / WEIGHTS, ns=(1, 1))  # clocks of file systems are coarse
+    after = Task("highway-fast-v0", "zeros", sizes_of=name)._forecasts()[0]
+    assert (before["edge_probs"].shape[-1], after["edge_probs"].shape[-1]) == (2 * 3, 2 * 2)
 
 
 def test_the_note_of_an_arm_gives_its_wrapper_back(tmp_path: Path):

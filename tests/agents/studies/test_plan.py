@@ -123,6 +123,8 @@ def test_what_the_file_says_of_a_cell_is_what_changes_its_result(tmp_path: Path)
     assert changed(text.replace("num_samples = 6", "num_samples = 7")) == [False, False, True]
     assert changed(text + 'env_kwargs = "{\\"config\\": {\\"vehicles_density\\": 3}}"\n') == [True, True, True]
     assert changed(text + "steps = 77\n") == [False, True, True]
+    orders = [said(f"{text}env_kwargs = {{config = {{{order}}}}}\n") for order in ("a = 1, b = 2", "b = 2, a = 1")]
+    assert orders[0] == orders[1]
     assert changed(study_text(arms=arms, episodes="7") + own[own.index("num") :]) == [True, True, True]
 
 

@@ -418,15 +418,18 @@ def test_the_report_alone_leaves_out_results_of_other_settings(
         ('backend = "gymnasium"', True),
         ("num_samples = 1", True),
         ("num_samples = 2", False),
+        ('[[arms]]\nname = "zeros"\nobserve = "zeros"\nnum_samples = 1', True),
+        ('[[arms]]\nname = "zeros"\nobserve = "zeros"\nnum_samples = 2', False),
         ("[algorithms.ppo]\ngamma = 0.8", True),
         ("[algorithms.ppo]\ngamma = 0.7", False),
     ],
 )
 def test_a_default_that_is_written_down_changes_no_setting(tmp_path: Path, more: str, same: bool):
-    text = 'arms = ["zeros"]\n{}[scenarios.corridor]\nenv_id = "merge-v1"\n{}'
-    before = read_study(study_path(tmp_path, text.format("", "")))
+    text = '{}[scenarios.corridor]\nenv_id = "merge-v1"\n{}'
+    arms = 'arms = ["zeros"]\n'
+    before = read_study(study_path(tmp_path, text.format(arms, "")))
     table, option = (f"{more}\n", "") if more.startswith("[") else ("", f"{more}\n")
-    now = read_study(study_path(tmp_path, text.format(table, option)))
+    now = read_study(study_path(tmp_path, text.format(table if "[[arms" in more else arms + table, option)))
     found = studies.result("zeros", [1.0], seed=0, env_id="merge-v1", scenario="corridor")
     found = replace(found, settings=before.settings_of(before.scenarios[0], before.arms[0], "ppo"))
     assert _has_settings_of(found, now) is same
