@@ -26,8 +26,9 @@ FEW = {
     "simple_speaker_listener_v4",
 }
 """Ids with one or two others, who stay far away or on one side: more of the squashed distances are near 1 or -1."""
-LARGEST = {"roundabout-v1": 25}
-"""Bound of the largest input where it is not 10: edge features have no scale, and those of this checkpoint reach 20."""
+LARGEST = {"roundabout-v1": 25, "roundabout-mixed-v0": 25}
+"""Bound of the largest input where it is not 10: edge features have no scale, and those of `roundabout` and of
+`roundabout-mixed`, which was trained from it, reach 20."""
 WITH_PLANS = (
     *("highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2"),
     *("highway-mixed-costly-v0", "intersection-costly-v0"),
