@@ -22,12 +22,8 @@ from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
 from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.cluster_pool import PACKAGES, episode_pool
-from envs.rollouts.episode import (
-    Case,
-    Episode,
-    EpisodeTask,
-    play,
-)
+from envs.rollouts.episode import Case, Episode, EpisodeTask, play
+from envs.rollouts.foreseen import check_can_foresee
 from envs.rollouts.graph_run import measure_graph
 from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
@@ -52,10 +48,9 @@ from predictor.support.runtime import keep_freed_memory
 GALLERY_CASES = 6
 """Number of worst forecasts that are drawn, at most one per episode."""
 
-
 USED_BY = {
     **dict.fromkeys(("num_samples", "memory_steps", "edge_ablations", "miss_m"), {"accuracy"}),
-    **dict.fromkeys(("perturbations", "most_episodes"), {"reactions"}),
+    **dict.fromkeys(("perturbations", "most_episodes", "hidden_draws"), {"reactions"}),
     "episodes": {"accuracy", "graph", "plans"},
     "data": {"accuracy", "reactions"},
     "horizon_steps": {"accuracy", "reactions", "plans"},
@@ -125,6 +120,9 @@ class EvaluateConfig:
     """Number of perturbations of each kind for --reactions."""
     most_episodes: int = 400
     """Largest number of episodes that --reactions plays in each environment to find so many."""
+    hidden_draws: int = 0
+    """Number of copies of each perturbed moment in which all that no scene shows is drawn anew, for the forecaster
+    "drivers known" of --reactions, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
     graph: bool = False
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
     agent brakes or is taken out), beside distance, "the leader", the commoner answer and trees on geometry (with
@@ -144,7 +142,7 @@ class EvaluateConfig:
             raise UserError("give at least one of --env-ids")
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
         check_at_least(self, 1, "perturbations", "most_episodes")
-        check_at_least(self, 0, "seed")
+        check_at_least(self, 0, "seed", "hidden_draws")
         for name in ("episodes", "num_samples"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
@@ -303,6 +301,8 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
     for env_id, driver in drivers.items():  # raises before hours of work
         if config.reactions or config.graph:
             check_can_branch(env_id, driver, config.env_kwargs)
+        if config.hidden_draws:
+            check_can_foresee(env_id, driver, config.env_kwargs)
         if config.plans:
             check_has_plans(env_id, driver, config.env_kwargs)
     shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
@@ -312,12 +312,11 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
         runs = [
             ReactionRun(
                 **settings | {"episodes": config.most_episodes},
-                perturbations=config.perturbations,
-                horizon_steps=config.horizon_steps,
-                stores=_stores_of(config, settings["env_id"]),
+                perturbations=config.perturbations, horizon_steps=config.horizon_steps,
+                stores=_stores_of(config, settings["env_id"]), hidden_draws=config.hidden_draws,
             )
             for settings in shared
-        ]
+        ]  # fmt: skip
         _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
     if config.graph:
         edges = [CauseRun(**settings) for settings in shared]

@@ -212,7 +212,7 @@ def _with_twin(episode: Episode, found: Branches, before: Sequence[Scene], has_e
     turns on centimetres, and the difference of the two futures is then no reaction.
     """
     plain = _scenes(found.ids, found.plain)
-    crashed = found.plain.crashed | found.perturbed.crashed
+    crashed = found.crashed
     if has_ego:
         crashed -= {int(found.ids[0])}
     kept = [replace(scene, valid=scene.valid & ~np.isin(scene.ids, list(crashed))) for scene in plain[1:]]

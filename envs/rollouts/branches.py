@@ -71,6 +71,17 @@ class Branches:
         moved = self.perturbed.states[..., : self.axes] - self.plain.states[..., : self.axes]
         return np.where(valid[..., None], moved, 0.0), valid
 
+    def shift_of(self, agent: int) -> Float[np.ndarray, "horizon axes"] | None:
+        """Returns one agent's shift at each step ahead [m]; None if one of the branches does not have it to the end."""
+        shift_m, valid = self.shift()
+        column = self.ids.tolist().index(agent)
+        return shift_m[1:, column] if valid[:, column].all() else None
+
+    @property
+    def crashed(self) -> frozenset[int]:
+        """Ids of the agents that have crashed by the end of one of the branches."""
+        return self.plain.crashed | self.perturbed.crashed
+
 
 def branch(world: World, intervention: Intervention, horizon_steps: int) -> Branches:
     """Plays the next steps with and without an intervention, in copies of the world.

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint
 from envs.rollouts.cause_run import FIRST_STEP, CauseTask
+from envs.rollouts.foreseen import foreseen_shift
 from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
@@ -31,7 +32,7 @@ from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
 from predictor.scene import Scene, SceneSpec
 
-STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
+STRAIGHT, NEIGHBOURS, FORESEEN = "constant velocity", "nearest neighbours", "drivers known"
 """Names of the forecasters that no checkpoint holds."""
 SHARE = 0.15
 """Probability that agents are perturbed at a step."""
@@ -52,6 +53,8 @@ class ReactionTask(CauseTask):
     """Names of the cells to measure; what is found in one does not depend on the others."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
+    hidden_draws: int = 0
+    """Number of worlds that look the same, of which the mean is foreseen (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def play_reactions(task: ReactionTask) -> list[Perturbation]:
         for forecaster in forecasters.values():
             forecaster.observe(world.perceived())
         if chosen:
-            moment = Moment(world, before, forecasters, task.horizon_steps)
+            moment = Moment(world, before, forecasters, task.horizon_steps, task.hidden_draws)
             cells = cells_of(world)
             for cell, own in zip(cells, rng.spawn(len(cells)), strict=True):
                 if cell.name in task.cells and (one := moment.perturbed(cell, own)) is not None:
@@ -108,6 +111,7 @@ class Moment:
         before: forecasters that have not observed the present scene yet.
         now: the same forecasters, which have.
         horizon_steps: number of steps to forecast and to play.
+        hidden_draws: number of worlds that look the same, of which the mean is foreseen; 0 for none.
     """
 
     def __init__(
@@ -116,9 +120,11 @@ class Moment:
         before: Mapping[str, SideForecaster],
         now: Mapping[str, SideForecaster],
         horizon_steps: int,
+        hidden_draws: int = 0,
     ) -> None:
         """Keeps all, and plays nothing before it is needed."""
         self._world, self._before, self._now, self._horizon = world, before, now, horizon_steps
+        self._draws = hidden_draws
         self._scene = world.perceived()
         self._tried: dict[Intervention, Branches | None] = {}
 
@@ -136,12 +142,15 @@ class Moment:
                 continue
             tried.add(intervention)
             branches = self._branches(intervention)
-            true_m = None if branches is None else _true_shift(branches, receiver)
+            true_m = None if branches is None else branches.shift_of(receiver)
             if branches is None or true_m is None or not is_moved_as_asked(cell, self._world, true_m):
                 continue
             predicted_m = self._predicted(branches.perturbed.perceived[0], receiver)
             if predicted_m is not None:
-                crashed = receiver in branches.plain.crashed | branches.perturbed.crashed
+                if self._draws:
+                    drawn = self._world, intervention, receiver, self._horizon, self._draws
+                    predicted_m[FORESEEN] = foreseen_shift(*drawn, rng)
+                crashed = receiver in branches.crashed
                 swerved = _swerved(branches, receiver) if is_on_roads(self._world) else None
                 return Perturbation(cell.name, 0, 0, sender, receiver, true_m, predicted_m, crashed, swerved)
         return None
@@ -186,13 +195,6 @@ def _place(scene: Scene, agent: int) -> int | None:
     """Returns an agent's index in a scene; None if it is not there."""
     found = np.flatnonzero(scene.valid & (scene.ids == agent))
     return int(found[0]) if len(found) else None
-
-
-def _true_shift(branches: Branches, receiver: int) -> Float[np.ndarray, "horizon axes"] | None:
-    """Returns the receiver's shift at each step ahead [m]; None if one of the branches does not have it to the end."""
-    shift_m, valid = branches.shift()
-    column = branches.ids.tolist().index(receiver)
-    return shift_m[1:, column] if valid[:, column].all() else None
 
 
 def _swerved(branches: Branches, receiver: int) -> bool:

@@ -1,0 +1,78 @@
+"""Shifts that somebody foresees who knows the drivers and the road, and of the rest only what scenes show.
+
+This is what knowledge allows, and no forecaster of scenes has: the simulator's own drivers, with their wishes. Goals,
+moments of looking aside and all coming random numbers are drawn anew, several times; the mean of the shifts is what is
+foreseen. Of unbiased forecasts none has a larger slope on average: a mean that is as good as can be has as slope the
+share of the true shifts that can be known.
+"""
+
+from contextlib import closing
+
+import numpy as np
+from highway_env.envs.common.abstract import AbstractEnv
+from jaxtyping import Float
+
+from envs.rollouts.branches import BranchPoint, copied
+from envs.rollouts.world import World, open_to_look
+from envs.simulators.hidden_traffic import redraw_hidden
+from envs.simulators.interventions import Intervention, simulator_of
+from predictor.support.errors import UserError
+
+
+def check_can_foresee(env_id: str, driver: str, env_kwargs: str = "") -> None:
+    """Checks that it is known what scenes of an environment do not show, so that it can be drawn anew.
+
+    Raises:
+        UserError: it is not one of highway-env with one ego, or the environment or the driver is unknown.
+    """
+    with closing(open_to_look(env_id, driver, env_kwargs)) as world:
+        if not isinstance(simulator_of(world.env), AbstractEnv) or not world.spec.has_ego:
+            raise UserError(
+                f"hidden_draws needs an environment of highway-env with one ego, got '{env_id}'; set it to 0"
+            )
+
+
+def redrawn(world: World, rng: np.random.Generator) -> World:
+    """Returns a copy of a world of highway-env in which all that scenes do not show is drawn anew.
+
+    Args:
+        world: running world; it is not changed.
+        rng: source of the numbers.
+    """
+    other = copied(world)
+    redraw_hidden(simulator_of(other.env), rng)
+    for generator in other.generators():
+        generator.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
+    return other
+
+
+def foreseen_shift(
+    world: World,
+    intervention: Intervention,
+    receiver: int,
+    horizon_steps: int,
+    draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "horizon axes"]:
+    """Returns the mean shift of an agent over worlds that look the same now [m], world axes.
+
+    Draws in which the agent leaves the road or crashes in one of the branches do not count; without any other, 0.
+
+    Args:
+        world: running world of highway-env; it is not changed.
+        intervention: what is done now.
+        receiver: id of the agent.
+        horizon_steps: number of steps to play.
+        draws: number of worlds.
+        rng: source of what is drawn.
+    """
+    found = []
+    for own in rng.spawn(draws):
+        branches = BranchPoint(redrawn(world, own), horizon_steps).perturbed(intervention)
+        shift_m = branches.shift_of(receiver)
+        if shift_m is not None and receiver not in branches.crashed:
+            found.append(shift_m)
+    if not found:
+        return np.zeros((horizon_steps, world.spec.position_dim))
+    mean: Float[np.ndarray, "horizon axes"] = np.mean(found, axis=0)
+    return mean
