@@ -121,8 +121,8 @@ class EvaluateConfig:
     most_episodes: int = 400
     """Largest number of episodes that --reactions plays in each environment to find so many."""
     hidden_draws: int = 0
-    """Number of copies of each perturbed moment in which all that no scene shows is drawn anew, for the forecaster
-    "drivers known" of --reactions, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
+    """Number of copies of each perturbed moment in which all that no scene shows is drawn anew: "drivers known" among
+    the forecasters of --reactions, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
     graph: bool = False
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
     agent brakes or is taken out), beside distance, "the leader", the commoner answer and trees on geometry (with

@@ -1,9 +1,8 @@
-"""Shifts that somebody foresees who knows the drivers and the road, and of the rest only what scenes show.
+"""Shifts that somebody foresees who knows the drivers and the road, and of the rest what can be seen.
 
-This is what knowledge allows, and no forecaster of scenes has: the simulator's own drivers, with their wishes. Goals,
-moments of looking aside and all coming random numbers are drawn anew, several times; the mean of the shifts is what is
-foreseen. Of unbiased forecasts none has a larger slope on average: a mean that is as good as can be has as slope the
-share of the true shifts that can be known.
+No forecaster of scenes knows as much: how each driver decides, and what it wishes. Goals, moments of looking aside and
+all coming random numbers are drawn anew, several times; the mean of the shifts is what is foreseen. In two ways: with
+every vehicle that is on the road, which bounds what can be known, and with those alone that the ego perceives.
 """
 
 from contextlib import closing
@@ -13,6 +12,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Float
 
 from envs.rollouts.branches import BranchPoint, copied
+from envs.rollouts.interventions import body_of
 from envs.rollouts.world import World, open_to_look
 from envs.simulators.hidden_traffic import redraw_hidden
 from envs.simulators.interventions import Intervention, simulator_of
@@ -32,15 +32,21 @@ def check_can_foresee(env_id: str, driver: str, env_kwargs: str = "") -> None:
             )
 
 
-def redrawn(world: World, rng: np.random.Generator) -> World:
-    """Returns a copy of a world of highway-env in which all that scenes do not show is drawn anew.
+def redrawn(world: World, rng: np.random.Generator, perceived_only: bool = False) -> World:
+    """Returns a copy of a world of highway-env in which what cannot be seen is drawn anew.
 
     Args:
         world: running world; it is not changed.
         rng: source of the numbers.
+        perceived_only: whether vehicles that the ego does not perceive are left out.
     """
     other = copied(world)
-    redraw_hidden(simulator_of(other.env), rng)
+    simulator = simulator_of(other.env)
+    if perceived_only:
+        scene = other.perceived()
+        seen = [body_of(other, int(agent)) for agent in scene.ids[scene.valid]]
+        simulator.road.vehicles = [vehicle for vehicle in simulator.road.vehicles if vehicle in seen]
+    redraw_hidden(simulator, rng)
     for generator in other.generators():
         generator.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
     return other
@@ -53,6 +59,8 @@ def foreseen_shift(
     horizon_steps: int,
     draws: int,
     rng: np.random.Generator,
+    *,
+    perceived_only: bool = False,
 ) -> Float[np.ndarray, "horizon axes"]:
     """Returns the mean shift of an agent over worlds that look the same now [m], world axes.
 
@@ -65,10 +73,12 @@ def foreseen_shift(
         horizon_steps: number of steps to play.
         draws: number of worlds.
         rng: source of what is drawn.
+        perceived_only: whether vehicles that the ego does not perceive are left out.
     """
     found = []
     for own in rng.spawn(draws):
-        branches = BranchPoint(redrawn(world, own), horizon_steps).perturbed(intervention)
+        point = BranchPoint(redrawn(world, own, perceived_only), horizon_steps)
+        branches = point.perturbed(intervention)
         shift_m = branches.shift_of(receiver)
         if shift_m is not None and receiver not in branches.crashed:
             found.append(shift_m)

@@ -32,8 +32,10 @@ from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
 from predictor.scene import Scene, SceneSpec
 
-STRAIGHT, NEIGHBOURS, FORESEEN = "constant velocity", "nearest neighbours", "drivers known"
+STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
 """Names of the forecasters that no checkpoint holds."""
+FORESEEN = {"drivers known": False, "drivers known, perceived vehicles alone": True}
+"""Names of what is foreseen (`envs.rollouts.foreseen`) → whether only the vehicles are known that the ego perceives."""
 SHARE = 0.15
 """Probability that agents are perturbed at a step."""
 MOST_BRANCHES = 4
@@ -148,8 +150,8 @@ class Moment:
             predicted_m = self._predicted(branches.perturbed.perceived[0], receiver)
             if predicted_m is not None:
                 if self._draws:
-                    drawn = self._world, intervention, receiver, self._horizon, self._draws
-                    predicted_m[FORESEEN] = foreseen_shift(*drawn, rng)
+                    drawn = self._world, intervention, receiver, self._horizon, self._draws, rng
+                    predicted_m |= {name: foreseen_shift(*drawn, perceived_only=one) for name, one in FORESEEN.items()}
                 crashed = receiver in branches.crashed
                 swerved = _swerved(branches, receiver) if is_on_roads(self._world) else None
                 return Perturbation(cell.name, 0, 0, sender, receiver, true_m, predicted_m, crashed, swerved)

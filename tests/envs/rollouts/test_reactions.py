@@ -13,7 +13,7 @@ from envs.rollouts import reactions
 from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.cause_run import FIRST_STEP
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
-from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
+from envs.rollouts.reactions import FORESEEN, NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import SideForecaster, open_for_checkpoints
 from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
@@ -260,10 +260,28 @@ def test_who_only_drives_slower_or_faster_does_not_swerve(plain: Any, perturbed:
 
 def test_a_receiver_that_one_branch_loses_has_no_true_shift():
     both = branches_of([(0, 0), (20, 0), (40, 0)], [(0, 0), (15, 0), (28, 0)])
-    shift_m = reactions._true_shift(both, 7)
+    shift_m = both.shift_of(7)
     assert shift_m is not None and shift_m.tolist() == [[-5, 0], [-12, 0]]
     both.perturbed.valid[-1] = False
-    assert reactions._true_shift(both, 7) is None
+    assert both.shift_of(7) is None
+
+
+def test_drivers_known_stands_beside_the_forecasters_and_changes_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reactions, "SHARE", 0.5)
+    asked = ReactionTask(
+        env_id="intersection-v2", driver="idle", checkpoints=("constant-velocity",), seed=3, max_steps=6,
+        horizon_steps=3, cells=("taken out",),
+    )  # fmt: skip
+    without, beside = play_reactions(asked), play_reactions(replace(asked, hidden_draws=2))
+    assert without and all(list(one.predicted_m) == [STRAIGHT, *FORESEEN] for one in beside)
+    for one, other in zip(without, beside, strict=True):
+        assert (one.step, one.sender, one.receiver) == (other.step, other.sender, other.receiver)
+        np.testing.assert_array_equal(one.true_m, other.true_m)
+        np.testing.assert_array_equal(one.predicted_m[STRAIGHT], other.predicted_m[STRAIGHT])
+    again = play_reactions(replace(asked, hidden_draws=2))
+    for one, other in zip(again, beside, strict=True):
+        for name in FORESEEN:
+            np.testing.assert_array_equal(one.predicted_m[name], other.predicted_m[name])
 
 
 def test_what_is_asked_uses_up_no_noise_of_the_forecasters(monkeypatch: pytest.MonkeyPatch):
