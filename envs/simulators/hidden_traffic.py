@@ -14,15 +14,13 @@ EXITS = ("exr", "sxr", "nxr", "wxr")
 
 
 def redraw_hidden(env: AbstractEnv, rng: np.random.Generator) -> None:
-    """Draws anew the goals of all vehicles but the egos, and the moments at which they may begin a change of lane.
+    """Draws anew where all drivers of the traffic are going, and when they may next begin a change of lane.
 
     Args:
         env: simulator, which is changed: a copy.
         rng: source of the numbers.
     """
     for vehicle in env.road.vehicles:
-        if vehicle in env.controlled_vehicles:
-            continue
         if isinstance(vehicle, IDMVehicle):
             vehicle.timer = rng.uniform(0.0, vehicle.LANE_CHANGE_DELAY)
             if goals := possible_goals(env, vehicle):

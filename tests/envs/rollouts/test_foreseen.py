@@ -25,6 +25,11 @@ def queue() -> World:
     return world
 
 
+def vehicles_of(world: World) -> list[Any]:
+    found: list[Any] = world.env.unwrapped.road.vehicles  # type: ignore[union-attr]
+    return found
+
+
 def crossing() -> World:
     world = open_world("intersection-v2", "slower")
     world.reset(4)
@@ -63,6 +68,10 @@ def test_worlds_that_are_drawn_look_the_same_now_and_go_on_differently():
     others = [redrawn(world, rng) for _ in range(4)]
     for other in others:
         assert_same_scenes([other.full_scene()], [world.full_scene()])
+    streams = [str([own.bit_generator.state for own in one.generators()]) for one in (world, *others)]
+    assert len(set(streams)) == 5
+    timers = [[one.timer for one in vehicles_of(each) if hasattr(one, "timer")] for each in (world, *others)]
+    assert len({str(times) for times in timers}) == 5
     ends = {played(other, STEPS)[-1].states.tobytes() for other in others}
     assert len(ends) == len(others)
 

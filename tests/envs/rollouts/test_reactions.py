@@ -279,6 +279,12 @@ def test_drivers_known_stands_beside_the_forecasters_and_changes_nothing_else(mo
         np.testing.assert_array_equal(one.true_m, other.true_m)
         np.testing.assert_array_equal(one.predicted_m[STRAIGHT], other.predicted_m[STRAIGHT])
     again = play_reactions(replace(asked, hidden_draws=2))
+    asked_for: list[bool] = []
+    monkeypatch.setattr(
+        reactions, "foreseen_shift", lambda *_, perceived_only: asked_for.append(perceived_only) or np.zeros((3, 2))
+    )
+    play_reactions(replace(asked, hidden_draws=2))
+    assert asked_for == [False, True] * len(beside)
     for one, other in zip(again, beside, strict=True):
         for name in FORESEEN:
             np.testing.assert_array_equal(one.predicted_m[name], other.predicted_m[name])
