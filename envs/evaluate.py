@@ -50,7 +50,8 @@ GALLERY_CASES = 6
 
 USED_BY = {
     **dict.fromkeys(("num_samples", "memory_steps", "edge_ablations", "miss_m"), {"accuracy"}),
-    **dict.fromkeys(("perturbations", "most_episodes", "hidden_draws"), {"reactions"}),
+    **dict.fromkeys(("perturbations", "most_episodes"), {"reactions"}),
+    "hidden_draws": {"reactions", "plans"},
     "episodes": {"accuracy", "graph", "plans"},
     "data": {"accuracy", "reactions"},
     "horizon_steps": {"accuracy", "reactions", "plans"},
@@ -84,8 +85,7 @@ class EvaluateConfig:
     (slower, action-4), or the path of a policy .zip (which gets the forecasts that it was trained on). Many learners:
     random, idle, varied, heuristic (default), mixed. Both: own:module:function (docs/wrap_your_env.md)."""
     seed: int = 900_000
-    """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
-    on."""
+    """Random seed: episode i is reset with seed + i; shipped checkpoints were trained on seeds from 100,000 on."""
     num_samples: int = 20
     """Number of forecasts (K) of the best-of-K error; K = 1, the single forecast, is always measured, too."""
     horizon_steps: int | None = None
@@ -121,8 +121,8 @@ class EvaluateConfig:
     most_episodes: int = 400
     """Largest number of episodes that --reactions plays in each environment to find so many."""
     hidden_draws: int = 0
-    """Number of copies of each perturbed moment in which all that no scene shows is drawn anew: "drivers known" among
-    the forecasters of --reactions, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
+    """Number of copies of each moment in which all that no scene shows is drawn anew: "drivers known" among the
+    forecasters of --reactions and --plans, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
     graph: bool = False
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
     agent brakes or is taken out), beside distance, "the leader", the commoner answer and trees on geometry (with
@@ -322,7 +322,8 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
         edges = [CauseRun(**settings) for settings in shared]
         _measure_all(config, console, "graph", edges, measure_graph, graph_report)
     if config.plans:
-        plans = [PlanRun(**settings, horizon_steps=config.horizon_steps) for settings in shared]
+        own = config.horizon_steps, config.hidden_draws
+        plans = [PlanRun(**settings, horizon_steps=own[0], hidden_draws=own[1]) for settings in shared]
         _measure_all(config, console, "plans", plans, measure_plans, plan_report)
 
 

@@ -4,7 +4,7 @@ Environments draw from `numpy.random.default_rng(seed)`: Gymnasium, PettingZoo a
 driver whose generator had the same seed would draw the numbers that set the environment's start, and its hidden habits
 could be inferred from the first scene. Each driver therefore draws from a child of the seed's `SeedSequence`. So do
 random interventions, the choice of the steps that get causal labels, branches, what is perturbed to measure reactions,
-and the steps at which plans are played, whatever the number of drivers.
+the steps at which plans are played, and what is drawn anew there, whatever the number of drivers.
 """
 
 from enum import IntEnum
@@ -25,6 +25,8 @@ class Purpose(IntEnum):
     """Steps and agents at which reactions are measured."""
     PLANS = 2**16 + 4
     """Steps at which what-if forecasts are measured."""
+    HIDDEN = 2**16 + 5
+    """What no scene shows, drawn anew where what-if forecasts are measured."""
 
 
 def episode_rng(seed: int, purpose: Purpose) -> np.random.Generator:

@@ -1,11 +1,13 @@
-"""Shifts that somebody foresees who knows the drivers and the road, and of the rest what can be seen.
+"""What somebody foresees who knows the drivers and the road, and of the rest what can be seen.
 
 No forecaster of scenes knows as much: how each driver decides, and what it wishes. Goals, moments of looking aside and
-all coming random numbers are drawn anew, several times; the mean of the shifts is what is foreseen. In two ways: with
-every vehicle that is on the road, which bounds what can be known, and with those alone that the ego perceives.
+all coming random numbers are drawn anew, several times; the mean of what then happens is what is foreseen. In two ways:
+with every vehicle that is on the road, which bounds what can be known, and with those alone that the ego perceives.
 """
 
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
@@ -17,6 +19,9 @@ from envs.rollouts.world import World, open_to_look
 from envs.simulators.hidden_traffic import redraw_hidden
 from envs.simulators.interventions import Intervention, simulator_of
 from predictor.support.errors import UserError
+
+FORESEEN = {"drivers known": False, "drivers known, perceived vehicles alone": True}
+"""Names in tables → whether only the vehicles are known that the ego perceives."""
 
 
 def check_can_foresee(env_id: str, driver: str, env_kwargs: str = "") -> None:
@@ -86,3 +91,29 @@ def foreseen_shift(
         return np.zeros((horizon_steps, world.spec.position_dim))
     mean: Float[np.ndarray, "horizon axes"] = np.mean(found, axis=0)
     return mean
+
+
+def foreseen_risk(
+    world: World,
+    drivers: Sequence[Callable[[], Callable[[Any], Any]]],
+    horizon_steps: int,
+    draws: int,
+    rng: np.random.Generator,
+    *,
+    perceived_only: bool = False,
+) -> Float[np.ndarray, " drivers"]:
+    """Returns the share of worlds that look the same now in which the ego collides, for each driver of the ego.
+
+    Args:
+        world: running world of highway-env; it is not changed.
+        drivers: functions that make a driver of the ego, which may keep count of its steps.
+        horizon_steps: number of steps to play.
+        draws: number of worlds.
+        rng: source of what is drawn.
+        perceived_only: whether vehicles that the ego does not perceive are left out.
+    """
+    hits = np.zeros(len(drivers))
+    for own in rng.spawn(draws):
+        point = BranchPoint(redrawn(world, own, perceived_only), horizon_steps, perturbs=False)
+        hits += [int(point.ids[0]) in point.driven(make()).crashed for make in drivers]
+    return hits / draws

@@ -5,6 +5,7 @@ with each plan of the environment's plan model, all with equal random numbers. E
 others will do if the ego does what it then did, or follows the plan; and how likely the plan ends in a collision.
 """
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -17,11 +18,12 @@ from envs.plans.base import Plans
 from envs.plans.contact import contacts
 from envs.rollouts.branches import Branch, BranchPoint
 from envs.rollouts.cause_run import CauseTask
+from envs.rollouts.foreseen import FORESEEN, foreseen_risk
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.reactions import STRAIGHT
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
 from envs.rollouts.world import EgoWorld, World
-from envs.seeding import Purpose
+from envs.seeding import Purpose, episode_rng
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import has_scale
 from predictor.scene import Forecast, Scene, SceneBatch
@@ -34,6 +36,8 @@ class PlanTask(CauseTask):
 
     horizon_steps: int
     """Number of steps forecast and played."""
+    hidden_draws: int = 0
+    """Number of worlds that look the same, in which plans are played as well (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ class PlanMoment:
     with_m: dict[str, Float[np.ndarray, " branches"]]
     """Such a sum for the forecast that is given the plan; in branch 0 the plan is what the ego then did."""
     risk: dict[str, Float[np.ndarray, " plans"]]
-    """Forecast probability of a collision within the horizon, by forecaster; the own driver has none."""
+    """Forecast probability of a collision within the horizon, by forecaster; the own driver has none. Whoever knows the
+    drivers (`envs.rollouts.foreseen`) has this alone."""
     risk_of_planner: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability with the plan model's margin around every agent, by which the planner chooses."""
 
@@ -79,7 +84,7 @@ def play_plans(task: PlanTask) -> list[PlanMoment]:
         for forecaster in forecasters.values():
             forecaster.observe(world.perceived())
         if step in measured:
-            asked = moment(world, model, forecasters, task.seed, step, task.horizon_steps)
+            asked = moment(world, model, forecasters, task.seed, step, task.horizon_steps, task.hidden_draws)
             if asked.whole:
                 moments.append(asked)
         if world.step() or (isinstance(world, EgoWorld) and world.crashed):
@@ -94,6 +99,7 @@ def moment(
     seed: int,
     step: int,
     horizon_steps: int,
+    hidden_draws: int = 0,
 ) -> PlanMoment:
     """Plays the present step with every plan.
 
@@ -104,6 +110,7 @@ def moment(
         seed: seed of the episode.
         step: step within the episode.
         horizon_steps: number of steps to play.
+        hidden_draws: number of worlds that look the same, in which the plans are played as well; 0 for none.
 
     Raises:
         UserError: the environment cannot be copied, or its plan model does not say how plans go on.
@@ -111,7 +118,8 @@ def moment(
     scene = world.perceived()
     plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features, scene, world.spec)
     point = BranchPoint(world, horizon_steps, perturbs=False)
-    played = [point.plain, *(point.driven(_taking(actions)) for actions in _scripts(plans, model))]
+    scripts = [functools.partial(_taking, actions) for actions in _scripts(plans, model)]
+    played = [point.plain, *(point.driven(begun()) for begun in scripts)]
     ego = int(point.ids[0])
     crashed = np.array([ego in branch.crashed for branch in played])
     whole = all(hit or not branch.cut for hit, branch in zip(crashed, played, strict=True))
@@ -136,6 +144,9 @@ def moment(
         )
         risk[name] = _risk(planned, scene, plans, world.spec.dt_s, 0.0)
         risk_of_planner[name] = _risk(planned, scene, plans, world.spec.dt_s, plans.margin_m)
+    if hidden_draws:
+        drawn = world, scripts, horizon_steps, hidden_draws, episode_rng(seed, Purpose.HIDDEN).spawn(step + 1)[step]
+        risk |= {name: foreseen_risk(*drawn, perceived_only=only) for name, only in FORESEEN.items()}
     agents = np.array([ok.sum() for ok in counted])
     return PlanMoment(seed, step, crashed, whole, agents, without_m, with_m, risk, risk_of_planner)
 

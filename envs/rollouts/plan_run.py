@@ -28,6 +28,8 @@ class PlanRun(CauseRun):
 
     horizon_steps: int | None = None
     """Number of steps forecast and played; None takes the first checkpoint's."""
+    hidden_draws: int = 0
+    """Number of worlds that look the same, in which plans are played as well (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class EnvPlans:
     crashed: list[float]
     """Share of the moments in which each plan ended in a collision."""
     scores: dict[str, PlanScores]
-    """Scores by forecaster."""
+    """Scores by forecaster; whoever knows the drivers (`envs.rollouts.foreseen`) has those of risks alone."""
     misfits: dict[str, str]
     """Reason for each checkpoint that was left out, by its name."""
     env_kwargs: str = ""
@@ -138,7 +140,10 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         names = plan_model_for(world.env).names
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
-    tasks = [PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon) for i in range(run.episodes)]
+    tasks = [
+        PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon, hidden_draws=run.hidden_draws)
+        for i in range(run.episodes)
+    ]
     with run.pool(play_plans) as pool:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
@@ -184,9 +189,13 @@ def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, "
 
     The choices are by the risk, and by the risk with the planner's margin.
     """
-    errors = np.array([[m.without_m[name], m.with_m[name], m.agents] for m in moments])  # moments, parts, branches
+    none = np.zeros(len(moments[0].crashed))
+    errors = np.array(  # moments, parts, branches
+        [[m.without_m[name], m.with_m[name], m.agents] if name in m.with_m else [none] * 3 for m in moments]
+    )
     choices = np.sum([right_choices(m.risk[name], m.crashed[1:]) for m in moments], axis=0)
-    guarded = np.sum([right_choices(m.risk_of_planner[name], m.crashed[1:]) for m in moments], axis=0)
+    guards = [right_choices(m.risk_of_planner[name], m.crashed[1:]) for m in moments if name in m.risk_of_planner]
+    guarded = np.sum(guards or [(0.0, 0)], axis=0)
     squares = np.sum([[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in moments], axis=0)
     return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, guarded, squares
 

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from envs.rollouts.branches import Branches, BranchPoint
 from envs.rollouts.cause_run import FIRST_STEP, CauseTask
-from envs.rollouts.foreseen import foreseen_shift
+from envs.rollouts.foreseen import FORESEEN, foreseen_shift
 from envs.rollouts.interventions import is_on_roads
 from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters
@@ -34,8 +34,6 @@ from predictor.scene import Scene, SceneSpec
 
 STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
 """Names of the forecasters that no checkpoint holds."""
-FORESEEN = {"drivers known": False, "drivers known, perceived vehicles alone": True}
-"""Names of what is foreseen (`envs.rollouts.foreseen`) → whether only the vehicles are known that the ego perceives."""
 SHARE = 0.15
 """Probability that agents are perturbed at a step."""
 MOST_BRANCHES = 4

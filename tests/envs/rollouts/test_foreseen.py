@@ -8,7 +8,7 @@ import pytest
 
 from envs.rollouts import foreseen
 from envs.rollouts.branches import Branches, BranchPoint, branch
-from envs.rollouts.foreseen import check_can_foresee, foreseen_shift, redrawn
+from envs.rollouts.foreseen import check_can_foresee, foreseen_risk, foreseen_shift, redrawn
 from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
 from predictor.support.errors import UserError
@@ -102,6 +102,40 @@ def test_draws_that_lose_the_agent_or_crash_it_do_not_count(monkeypatch: pytest.
     shift_m = foreseen_shift(world, OUT, 1, STEPS, 4, np.random.default_rng(0))
     np.testing.assert_allclose(shift_m, drawn[0].shift_of(1), rtol=0, atol=1e-9)
     assert len(drawn) == 4
+
+
+def test_a_risk_is_the_share_of_worlds_in_which_the_ego_collides():
+    """The ego closes in on a queue; whether it hits it is its own choice alone, and nothing hidden."""
+    world = road_world((30.0, 4.0), (60.0, 4.0), ego_m=(0.0, 4.0))
+    ego: Any = world.env.unwrapped.vehicle  # type: ignore[union-attr]
+    ego.speed = ego.target_speed = 30.0
+    begun: list[int] = []
+
+    def driver(action: int) -> Any:
+        def make() -> Any:
+            begun.append(action)
+            return lambda _: action
+
+        return make
+
+    idle, slower = 1, 4
+    risk = foreseen_risk(world, [driver(idle), driver(slower)], STEPS, 3, np.random.default_rng(0))
+    assert risk.tolist() == [1.0, 0.0]
+    assert begun == [idle, slower] * 3  # a driver that counts its steps begins anew in each world
+
+
+def test_a_risk_between_0_and_1_is_of_what_is_hidden(monkeypatch: pytest.MonkeyPatch):
+    world, played_in = crossing(), list[bool]()
+    driven = BranchPoint.driven
+
+    def hits_in_every_second_world(point: BranchPoint, driver: Any) -> Any:
+        played_in.append(True)
+        gone = frozenset({int(point.ids[0])}) if len(played_in) % 2 else frozenset[int]()
+        return replace(driven(point, driver), crashed=gone)
+
+    monkeypatch.setattr(BranchPoint, "driven", hits_in_every_second_world)
+    risk = foreseen_risk(world, [lambda: lambda _: 1], 1, 4, np.random.default_rng(0), perceived_only=True)
+    assert risk.tolist() == [0.5]
 
 
 def test_without_a_draw_that_counts_nothing_is_foreseen(monkeypatch: pytest.MonkeyPatch):

@@ -10,6 +10,7 @@ from envs.plans import plan_model_for
 from envs.rollouts import cause_run, plan_moments
 from envs.rollouts.branches import BranchPoint, copied
 from envs.rollouts.cause_run import EVERY, FIRST_STEP
+from envs.rollouts.foreseen import FORESEEN
 from envs.rollouts.plan_moments import STRAIGHT, PlanTask, moment, play_plans
 from envs.rollouts.side_forecasts import SideForecaster
 from envs.rollouts.world import EgoWorld, open_world
@@ -56,6 +57,19 @@ def test_a_plan_that_runs_into_the_car_ahead_collides_and_is_the_riskiest():
     assert found.crashed[0] == outcome["IDLE"]  # its own driver is idle
     risk = dict(zip(model.names, found.risk[STRAIGHT], strict=True))
     assert risk["FASTER"] == risk["IDLE"] == 1.0 and risk["LANE_LEFT"] == 0.0
+
+
+def test_whoever_knows_the_drivers_has_risks_and_no_errors():
+    """Nothing is hidden on that road but the driver of the ego, whom plans replace."""
+    world = slow_ahead()
+    model = plan_model_for(world.env)
+    plain = moment(world, model, observed(world), 0, 3, HORIZON)
+    found = moment(world, model, observed(world), 0, 3, HORIZON, hidden_draws=2)
+    assert [*found.risk] == [STRAIGHT, *FORESEEN] and [*plain.risk] == [STRAIGHT]
+    for name in FORESEEN:
+        np.testing.assert_array_equal(found.risk[name], found.crashed[1:])
+        assert name not in found.with_m | found.without_m | found.risk_of_planner
+    np.testing.assert_array_equal(found.risk[STRAIGHT], plain.risk[STRAIGHT])
 
 
 class Wide:

@@ -63,6 +63,15 @@ def test_scores_of_known_moments():
     assert scores.brier.value == pytest.approx((0.04 + 0.04 + 0.0 + 0.0 + 0.81 + 0.36) / 6)
 
 
+def test_whoever_has_risks_alone_is_scored_by_them():
+    known = found(0, [True, False], [0.8, 0.2])
+    known.risk["drivers known"] = np.array([0.5, 0.0])
+    scores = scores_of([[known]], "drivers known")
+    assert (scores.own.agents, scores.own.with_m, scores.plans.reduction) == (0, None, None)
+    assert scores.right is not None and scores.right.value == 1.0 and scores.right_of_planner is None
+    assert scores.brier is not None and scores.brier.value == pytest.approx(0.125)
+
+
 def test_a_plan_that_harms_lowers_the_reduction_below_zero():
     scores = scores_of([[found(i, [False, False], [0.0, 0.0], with_m=3.0)] for i in range(2)], "model")
     assert scores.own.reduction is not None and scores.own.reduction.value == -0.5

@@ -12,8 +12,9 @@ from envs.rollouts import branches as rollout_branches
 from envs.rollouts import reactions
 from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.cause_run import FIRST_STEP
+from envs.rollouts.foreseen import FORESEEN
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
-from envs.rollouts.reactions import FORESEEN, NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
+from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import SideForecaster, open_for_checkpoints
 from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
