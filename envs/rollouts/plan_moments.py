@@ -60,7 +60,7 @@ class PlanMoment:
     """Such a sum for the forecast that is given the plan; in branch 0 the plan is what the ego then did."""
     risk: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability of a collision within the horizon, by forecaster; the own driver has none. Whoever knows the
-    drivers (`envs.rollouts.foreseen`) has this alone."""
+    drivers (`envs.rollouts.foreseen`) has this alone, and only where some plans collide and others do not."""
     risk_of_planner: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability with the plan model's margin around every agent, by which the planner chooses."""
 
@@ -144,7 +144,7 @@ def moment(
         )
         risk[name] = _risk(planned, scene, plans, world.spec.dt_s, 0.0)
         risk_of_planner[name] = _risk(planned, scene, plans, world.spec.dt_s, plans.margin_m)
-    if hidden_draws:
+    if hidden_draws and len(set(crashed[1:].tolist())) == 2:  # it costs most, and elsewhere there is nothing to choose
         drawn = world, scripts, horizon_steps, hidden_draws, episode_rng(seed, Purpose.HIDDEN).spawn(step + 1)[step]
         risk |= {name: foreseen_risk(*drawn, perceived_only=only) for name, only in FORESEEN.items()}
     agents = np.array([ok.sum() for ok in counted])

@@ -85,7 +85,7 @@ class EnvPlans:
     crashed: list[float]
     """Share of the moments in which each plan ended in a collision."""
     scores: dict[str, PlanScores]
-    """Scores by forecaster; whoever knows the drivers (`envs.rollouts.foreseen`) has those of risks alone."""
+    """Scores by forecaster; whoever knows the drivers (`envs.rollouts.foreseen`) has that of its choices alone."""
     misfits: dict[str, str]
     """Reason for each checkpoint that was left out, by its name."""
     env_kwargs: str = ""
@@ -163,7 +163,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         names,
         len(moments),
         crashed.tolist(),
-        {name: scores_of(episodes, name) for name in moments[0].risk},
+        {name: scores_of(episodes, name) for name in dict.fromkeys(name for moment in moments for name in moment.risk)},
         misfits,
         run.env_kwargs,
     )
@@ -189,15 +189,16 @@ def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, "
 
     The choices are by the risk, and by the risk with the planner's margin.
     """
-    none = np.zeros(len(moments[0].crashed))
-    errors = np.array(  # moments, parts, branches
-        [[m.without_m[name], m.with_m[name], m.agents] if name in m.with_m else [none] * 3 for m in moments]
+    forecast = [m for m in moments if name in m.with_m]  # all, or of whoever has risks alone none
+    none = [np.zeros(len(moments[0].crashed))] * 3
+    errors = np.array([[m.without_m[name], m.with_m[name], m.agents] for m in forecast] or [none])
+    squares = [[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in forecast]
+    choices, guarded = (
+        [right_choices(risk[name], m.crashed[1:]) for m, risk in zip(moments, risks, strict=True) if name in risk]
+        for risks in ([m.risk for m in moments], [m.risk_of_planner for m in moments])
     )
-    choices = np.sum([right_choices(m.risk[name], m.crashed[1:]) for m in moments], axis=0)
-    guards = [right_choices(m.risk_of_planner[name], m.crashed[1:]) for m in moments if name in m.risk_of_planner]
-    guarded = np.sum(guards or [(0.0, 0)], axis=0)
-    squares = np.sum([[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in moments], axis=0)
-    return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, guarded, squares
+    counts = (np.sum([(0.0, 0), *pairs], axis=0) for pairs in (choices, guarded, squares))
+    return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), *counts
 
 
 def right_choices(risk: Float[np.ndarray, " plans"], crashed: Bool[np.ndarray, " plans"]) -> tuple[float, int]:

@@ -59,6 +59,13 @@ def test_a_plan_that_runs_into_the_car_ahead_collides_and_is_the_riskiest():
     assert risk["FASTER"] == risk["IDLE"] == 1.0 and risk["LANE_LEFT"] == 0.0
 
 
+def test_whoever_knows_the_drivers_is_asked_only_where_there_is_a_choice():
+    world = road_world((300.0, 0.0), ego_m=(0.0, 8.0))
+    world.step()
+    found = moment(world, plan_model_for(world.env), observed(world), 0, 3, HORIZON, hidden_draws=2)
+    assert not found.crashed.any() and [*found.risk] == [STRAIGHT]
+
+
 def test_whoever_knows_the_drivers_has_risks_and_no_errors():
     """Nothing is hidden on that road but the driver of the ego, whom plans replace."""
     world = slow_ahead()

@@ -63,13 +63,15 @@ def test_scores_of_known_moments():
     assert scores.brier.value == pytest.approx((0.04 + 0.04 + 0.0 + 0.0 + 0.81 + 0.36) / 6)
 
 
-def test_whoever_has_risks_alone_is_scored_by_them():
-    known = found(0, [True, False], [0.8, 0.2])
-    known.risk["drivers known"] = np.array([0.5, 0.0])
-    scores = scores_of([[known]], "drivers known")
+def test_whoever_has_risks_of_some_moments_alone_is_scored_by_its_choices():
+    moments = [found(0, [False, False], [0.0, 0.1]), found(0, [True, False], [0.8, 0.2])]
+    moments[1].risk["drivers known"] = np.array([0.5, 0.0])
+    scores = scores_of([moments, moments[:1]], "drivers known")
     assert (scores.own.agents, scores.own.with_m, scores.plans.reduction) == (0, None, None)
-    assert scores.right is not None and scores.right.value == 1.0 and scores.right_of_planner is None
-    assert scores.brier is not None and scores.brier.value == pytest.approx(0.125)
+    assert scores.choices == 1 and scores.right is not None and scores.right.value == 1.0
+    assert scores.right_of_planner is None and scores.brier is None
+    model = scores_of([moments, moments[:1]], "model")
+    assert (model.choices, model.own.agents) == (1, 9) and model.brier is not None
 
 
 def test_a_plan_that_harms_lowers_the_reduction_below_zero():
