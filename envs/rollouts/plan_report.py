@@ -1,5 +1,6 @@
 """Reports of `envs.evaluate --plans`: a table for a terminal and a page, and a figure of the errors and choices."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ HEADS = (
     "less by (95 %)", "pairs of plans", "right choices (95 %)", "… with margin (95 %)", "Brier score (95 %)",
 )  # fmt: skip
 """Columns of the table."""
+NAME_WIDTH = 18
+"""Largest width of a line of a forecaster's name under the figure [characters]."""
 
 
 def title(result: EnvPlans) -> str:
@@ -98,14 +101,19 @@ def write_picture(out: Path, result: EnvPlans) -> None:
 
 
 def plot_errors(ax: Axes, result: EnvPlans) -> Axes:
-    """Plots by how much the plan lowers the error, with intervals: the ego's true plan, and each played plan."""
+    """Plots by how much the plan lowers the error, with intervals: the ego's true plan, and each played plan.
+
+    Forecasters without errors are left out, where another one has some.
+    """
+    compared = {name: found for name, found in result.scores.items() if found.own.agents or found.plans.agents}
+    compared = compared or result.scores
     for shift, kind, label in ((-0.15, "own", "the ego's true plan"), (0.15, "plans", "plans, played")):
-        places = np.arange(len(result.scores)) + shift
-        _plot_estimates(ax, places, [getattr(found, kind).reduction for found in result.scores.values()], label)
+        places = np.arange(len(compared)) + shift
+        _plot_estimates(ax, places, [getattr(found, kind).reduction for found in compared.values()], label)
     ax.axhline(0, color="0.7", lw=0.8)
     ax.set_ylabel("error less by, with the plan given [%]")
     ax.legend(fontsize=8)
-    return _named(ax, result)
+    return _named(ax, [*compared])
 
 
 def plot_choices(ax: Axes, result: EnvPlans) -> Axes:
@@ -115,7 +123,7 @@ def plot_choices(ax: Axes, result: EnvPlans) -> Axes:
     ax.axhline(50, color="0.7", lw=0.8, ls=":", label="chance")
     ax.set(ylabel="right choices [%]", ylim=(0, 102))
     ax.legend(fontsize=8, loc="lower right")
-    return _named(ax, result)
+    return _named(ax, [*result.scores])
 
 
 def _plot_estimates(ax: Axes, places: np.ndarray, estimates: Sequence[Estimate | None], label: str) -> None:
@@ -126,8 +134,8 @@ def _plot_estimates(ax: Axes, places: np.ndarray, estimates: Sequence[Estimate |
     ax.errorbar(places, values, yerr=around, fmt="o", ms=5, capsize=3, label=label)
 
 
-def _named(ax: Axes, result: EnvPlans) -> Axes:
-    ax.set_xticks(range(len(result.scores)), list(result.scores))
-    ax.set_xlim(-0.5, len(result.scores) - 0.5)
+def _named(ax: Axes, names: Sequence[str]) -> Axes:
+    ax.set_xticks(range(len(names)), [textwrap.fill(name, NAME_WIDTH) for name in names], fontsize=8)
+    ax.set_xlim(-0.5, len(names) - 0.5)
     ax.grid(False, axis="x")
     return ax

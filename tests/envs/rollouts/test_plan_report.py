@@ -58,6 +58,18 @@ def test_curves_have_the_numbers():
     plt.close(figure)
 
 
+def test_whoever_has_choices_alone_stands_under_these_and_long_names_are_broken():
+    known = PlanScores(NOTHING, NOTHING, 12, Estimate(0.9, (0.8, 1.0)), None, None)
+    figure, (left, right) = plt.subplots(1, 2)
+    result = replace(RESULT, scores=SCORES | {"drivers known, perceived vehicles alone": known})
+    plot_errors(left, result)
+    plot_choices(right, result)
+    under = [[label.get_text() for label in ax.get_xticklabels()] for ax in (left, right)]
+    assert under[0] == ["constant velocity", "ours"]
+    assert under[1] == [*under[0], "drivers known,\nperceived vehicles\nalone"]
+    plt.close(figure)
+
+
 @pytest.mark.parametrize("scores", [SCORES, {"ours": PlanScores(NOTHING, NOTHING, 0, None, None, None)}])
 def test_a_figure_is_written(scores: dict[str, PlanScores], tmp_path: Path):
     write_picture(tmp_path, replace(RESULT, scores=scores))
