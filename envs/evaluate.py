@@ -143,7 +143,7 @@ class EvaluateConfig:
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
         check_at_least(self, 1, "perturbations", "most_episodes")
         check_at_least(self, 0, "seed", "hidden_draws")
-        for name in ("episodes", "num_samples"):
+        for name in ("episodes", "num_samples", "hidden_draws"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
         processes = min(self.workers, self.most_episodes if self.reactions else self.episodes)

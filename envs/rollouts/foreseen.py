@@ -14,7 +14,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Float
 
 from envs.rollouts.branches import BranchPoint, copied
-from envs.rollouts.interventions import body_of
+from envs.rollouts.interventions import body_of, kinds_of
 from envs.rollouts.world import World, open_to_look
 from envs.simulators.hidden_traffic import redraw_hidden
 from envs.simulators.interventions import Intervention, simulator_of
@@ -28,13 +28,15 @@ def check_can_foresee(env_id: str, driver: str, env_kwargs: str = "") -> None:
     """Checks that it is known what scenes of an environment do not show, so that it can be drawn anew.
 
     Raises:
-        UserError: it is not one of highway-env with one ego, or the environment or the driver is unknown.
+        UserError: it is not one of highway-env with one ego, its reader cannot find a vehicle by its id, or the
+            environment or the driver is unknown.
     """
     with closing(open_to_look(env_id, driver, env_kwargs)) as world:
         if not isinstance(simulator_of(world.env), AbstractEnv) or not world.spec.has_ego:
             raise UserError(
                 f"hidden_draws needs an environment of highway-env with one ego, got '{env_id}'; set it to 0"
             )
+        kinds_of(world)
 
 
 def redrawn(world: World, rng: np.random.Generator, perceived_only: bool = False) -> World:

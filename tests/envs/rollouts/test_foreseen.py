@@ -6,11 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.readers.function import FunctionReader
+from envs.registry import make_env
 from envs.rollouts import foreseen
 from envs.rollouts.branches import Branches, BranchPoint, branch
 from envs.rollouts.foreseen import check_can_foresee, foreseen_risk, foreseen_shift, redrawn
-from envs.rollouts.world import World, open_world
+from envs.rollouts.world import EgoWorld, World, open_world
 from envs.simulators.interventions import Intervention
+from envs.wrappers import SceneObservation
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played, road_world
 
@@ -142,6 +146,16 @@ def test_without_a_draw_that_counts_nothing_is_foreseen(monkeypatch: pytest.Monk
     monkeypatch.setattr(Branches, "shift_of", lambda self, agent: None)
     shift_m = foreseen_shift(queue(), OUT, 1, STEPS, 2, np.random.default_rng(0))
     np.testing.assert_array_equal(shift_m, np.zeros((STEPS, 2)))
+
+
+def test_a_reader_that_finds_no_vehicle_is_refused(monkeypatch: pytest.MonkeyPatch):
+    def read(env: object) -> Scene:
+        return Scene(np.zeros((1, 4)), np.zeros(1, dtype=np.int64), np.ones(1, dtype=np.bool_))
+
+    env = SceneObservation(make_env("highway-fast-v0"), reader=FunctionReader(read, SceneSpec(dt_s=1.0)))
+    monkeypatch.setattr(foreseen, "open_to_look", lambda *_: EgoWorld(env, "idle"))
+    with pytest.raises(UserError, match="cannot find an agent by its id"):
+        check_can_foresee("highway-fast-v0", "idle")
 
 
 @pytest.mark.parametrize("env_id", ["simple_tag_v3", "intersection-multi-agent-v2"])
