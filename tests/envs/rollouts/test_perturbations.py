@@ -81,7 +81,7 @@ def test_interventions_follow_from_the_seed_alone():
 def test_streams_are_independent():
     streams = [episode_rng(5, purpose) for purpose in Purpose]
     streams += [driver_rng(5), driver_rng(5, 1), np.random.default_rng(5)]
-    assert len({tuple(rng.random(4).tolist()) for rng in streams}) == 8
+    assert len({tuple(rng.random(4).tolist()) for rng in streams}) == 3 + len(Purpose)
     first = [episode_rng(seed, Purpose.PERTURBATIONS).random() for seed in (5, 5, 6)]
     assert first[0] == first[1] != first[2]
 
