@@ -6,8 +6,8 @@ from functools import cache
 _ZERO = (
     "at-step batch-size branches causal-labels curriculum-steps edge-cost edge-probability energy-weight "
     "episode-steps episodes frame-step hidden-draws joint-energy-weight kicks kl-warmup-steps kl-weight label-weight "
-    "max-episodes max-windows min-history-steps one-step-weight ood peak-tflops perturb reaction-weight replaced rollout-weight "
-    "seed share shift-weight steps test threads train type-label-weight val workers"
+    "max-episodes max-windows min-history-steps one-step-weight ood peak-tflops perturb reaction-weight replaced "
+    "rollout-weight seed share shift-weight steps test threads train type-label-weight val workers"
 ).split()
 
 ARGUED: tuple[tuple[str, str, str], ...] = (
