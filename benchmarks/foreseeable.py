@@ -22,6 +22,7 @@ from agents.policy import load_policy
 from envs.drivers.all_agents import Habits
 from envs.parallel import ForecastParallelEnv
 from envs.plans.keeping_on import CopyableParallelEnv, all_keeping_on
+from envs.seeding import reseed
 from envs.simulators.copies import running_copy
 from envs.simulators.interventions import simulator_of
 from predictor.checkpoint import load_checkpoint
@@ -106,7 +107,7 @@ def redrawn(env: ForecastParallelEnv, rng: np.random.Generator, habits: bool = F
     world: Any = CopyableParallelEnv(env.env)
     copied, reader = running_copy((world, env.reader), simulator_of(env.env))
     for own in generators_of(copied.env._driver):
-        own.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
+        reseed(own, rng)
     if habits:
         [drivers] = [part for part in copied.env._driver.args if isinstance(part, dict)]
         drivers.update({agent: with_habits(driver, Habits.draw(rng)) for agent, driver in drivers.items()})

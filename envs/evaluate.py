@@ -146,8 +146,7 @@ class EvaluateConfig:
         for name in ("episodes", "num_samples", "hidden_draws"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
-        processes = min(self.workers, self.most_episodes if self.reactions else self.episodes)
-        check_count(processes, "workers", PROCESS_BYTES)
+        check_count(min(self.workers, self.most_episodes if self.reactions else self.episodes), "workers", PROCESS_BYTES)
         check_address(self.cluster)
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:
@@ -312,18 +311,18 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
         runs = [
             ReactionRun(
                 **settings | {"episodes": config.most_episodes},
-                perturbations=config.perturbations, horizon_steps=config.horizon_steps,
-                stores=_stores_of(config, settings["env_id"]), hidden_draws=config.hidden_draws,
+                perturbations=config.perturbations,
+                horizon_steps=config.horizon_steps,
+                stores=_stores_of(config, settings["env_id"]),
             )
             for settings in shared
-        ]  # fmt: skip
+        ]
         _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
     if config.graph:
         edges = [CauseRun(**settings) for settings in shared]
         _measure_all(config, console, "graph", edges, measure_graph, graph_report)
     if config.plans:
-        own = config.horizon_steps, config.hidden_draws
-        plans = [PlanRun(**settings, horizon_steps=own[0], hidden_draws=own[1]) for settings in shared]
+        plans = [PlanRun(**settings, horizon_steps=config.horizon_steps) for settings in shared]
         _measure_all(config, console, "plans", plans, measure_plans, plan_report)
 
 
@@ -333,6 +332,7 @@ def _settings(config: EvaluateConfig, env_id: str, driver: str) -> dict[str, Any
         "env_id": env_id, "driver": driver, "checkpoints": config.checkpoint or (checkpoint_for(env_id),),
         "episodes": config.episodes, "seed": config.seed, "max_steps": config.max_steps, "workers": config.workers,
         "timeout_s": config.timeout_s, "cluster": config.cluster, "env_kwargs": config.env_kwargs,
+        "hidden_draws": config.hidden_draws,
     }  # fmt: skip
 
 

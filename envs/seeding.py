@@ -43,3 +43,8 @@ def driver_rng(seed: int | None, group: int = 0) -> np.random.Generator:
             independently.
     """
     return np.random.default_rng(np.random.SeedSequence(seed).spawn(group + 1)[group])
+
+
+def reseed(generator: np.random.Generator, rng: np.random.Generator) -> None:
+    """Lets a generator, wherever it is held, go on with numbers that another one draws."""
+    generator.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state

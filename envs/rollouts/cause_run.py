@@ -34,6 +34,9 @@ class CauseTask:
     """Largest length of an episode [policy steps]."""
     env_kwargs: str = ""
     """Arguments of the environment, as the text of a JSON object; empty for none."""
+    hidden_draws: int = 0
+    """Number of worlds that look the same, in which is played what somebody foresees (`envs.rollouts.foreseen`); 0 for
+    none. Inferred edges have no use for it."""
 
     def opened(self) -> World:
         """Returns the world of the episode, reset; a process keeps it for its next one."""

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from envs.rollouts.branches import BranchPoint, copied
 from envs.rollouts.interventions import body_of, kinds_of
 from envs.rollouts.world import World, open_to_look
+from envs.seeding import reseed
 from envs.simulators.hidden_traffic import redraw_hidden
 from envs.simulators.interventions import Intervention, simulator_of
 from predictor.support.errors import UserError
@@ -55,7 +56,7 @@ def redrawn(world: World, rng: np.random.Generator, perceived_only: bool = False
         simulator.road.vehicles = [vehicle for vehicle in simulator.road.vehicles if vehicle in seen]
     redraw_hidden(simulator, rng)
     for generator in other.generators():
-        generator.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
+        reseed(generator, rng)
     return other
 
 

@@ -36,8 +36,6 @@ class PlanTask(CauseTask):
 
     horizon_steps: int
     """Number of steps forecast and played."""
-    hidden_draws: int = 0
-    """Number of worlds that look the same, in which plans are played as well (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,6 @@ class PlanRun(CauseRun):
 
     horizon_steps: int | None = None
     """Number of steps forecast and played; None takes the first checkpoint's."""
-    hidden_draws: int = 0
-    """Number of worlds that look the same, in which plans are played as well (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +138,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         names = plan_model_for(world.env).names
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
-    tasks = [
-        PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon, hidden_draws=run.hidden_draws)
-        for i in range(run.episodes)
-    ]
+    tasks = [PlanTask(**run.of_episode(i, fitting), horizon_steps=horizon) for i in range(run.episodes)]
     with run.pool(play_plans) as pool:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]

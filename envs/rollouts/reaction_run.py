@@ -27,8 +27,6 @@ class ReactionRun(CauseRun):
     """Number of steps forecast and played; None takes the first checkpoint's."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
-    hidden_draws: int = 0
-    """Number of worlds that look the same, of which the mean is foreseen (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +124,8 @@ def _play_until_enough(
             wave = range(played, min(played + 2 * pool.size, run.episodes))
             tasks = [
                 ReactionTask(
-                    **run.of_episode(i, checkpoints),
-                    horizon_steps=horizon_steps,
-                    cells=wanted,
-                    stores=run.stores,
-                    hidden_draws=run.hidden_draws,
-                )  # fmt: skip
+                    **run.of_episode(i, checkpoints), horizon_steps=horizon_steps, cells=wanted, stores=run.stores
+                )
                 for i in wave
             ]
             for episode, ones in zip(wave, pool.results(tasks), strict=True):

@@ -53,8 +53,6 @@ class ReactionTask(CauseTask):
     """Names of the cells to measure; what is found in one does not depend on the others."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
-    hidden_draws: int = 0
-    """Number of worlds that look the same, of which the mean is foreseen (`envs.rollouts.foreseen`); 0 for none."""
 
 
 @dataclass(frozen=True)
