@@ -121,8 +121,7 @@ class EvaluateConfig:
     most_episodes: int = 400
     """Largest number of episodes that --reactions plays in each environment to find so many."""
     hidden_draws: int = 0
-    """Number of copies of each moment in which all that no scene shows is drawn anew: "drivers known" among the
-    forecasters of --reactions and --plans, on highway-env's roads (docs/reactions.md); 0 leaves it out."""
+    """Number of copies of each moment in which what no scene shows is drawn anew (docs/reactions.md); 0 for none."""
     graph: bool = False
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
     agent brakes or is taken out), beside distance, "the leader", the commoner answer and trees on geometry (with
@@ -146,7 +145,8 @@ class EvaluateConfig:
         for name in ("episodes", "num_samples", "hidden_draws"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
-        check_count(min(self.workers, self.most_episodes if self.reactions else self.episodes), "workers", PROCESS_BYTES)
+        processes = min(self.workers, self.most_episodes if self.reactions else self.episodes)
+        check_count(processes, "workers", PROCESS_BYTES)
         check_address(self.cluster)
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:

@@ -167,3 +167,28 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def test_an_option_that_nothing_uses_is_refused(options: dict[str, Any], message: str):
     with pytest.raises(UserError, match=f"^{message}$"):
         evaluate.EvaluateConfig((TAG,), **options)
+
+
+def test_draws_reach_what_is_measured(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    seen: list[int] = []
+
+    def measure(run: Any) -> Any:
+        seen.append(run.hidden_draws)
+        raise UserError("enough")
+
+    for name in ("measure_reactions", "measure_plans"):
+        monkeypatch.setattr(evaluate, name, measure)
+    for kind in ("--reactions", "--plans"):
+        arguments = [kind, "--env-ids", "merge-v1", "--checkpoint", STILL, "--hidden-draws", "3", "--workers", "1"]
+        code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+        assert code and "enough" in errors[0]
+    assert seen == [3, 3]
+
+
+@pytest.mark.parametrize(("draws", "sentence"), [("2", "needs an environment of highway-env"), (str(10**12), "GiB")])
+def test_draws_that_are_not_possible_are_refused_in_a_line(
+    draws: str, sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    arguments = ["--reactions", "--env-ids", TAG, "--checkpoint", STILL, "--hidden-draws", draws]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert code and len(errors) == 1 and "hidden_draws" in errors[0] and sentence in errors[0]

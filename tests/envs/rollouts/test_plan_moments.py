@@ -66,6 +66,27 @@ def test_whoever_knows_the_drivers_is_asked_only_where_there_is_a_choice():
     assert not found.crashed.any() and [*found.risk] == [STRAIGHT]
 
 
+def test_both_who_know_the_drivers_are_asked(monkeypatch: pytest.MonkeyPatch):
+    asked: list[bool] = []
+
+    def risk(*given: Any, perceived_only: bool) -> np.ndarray:
+        asked.append(perceived_only)
+        return np.zeros(len(given[1]))
+
+    monkeypatch.setattr(plan_moments, "foreseen_risk", risk)
+    world = slow_ahead()
+    moment(world, plan_model_for(world.env), observed(world), 0, 3, HORIZON, hidden_draws=2)
+    assert asked == [False, True]
+
+
+def test_an_episode_hands_the_number_of_draws_on(monkeypatch: pytest.MonkeyPatch):
+    handed: list[int] = []
+    ask = plan_moments.moment
+    monkeypatch.setattr(plan_moments, "moment", lambda *given: handed.append(given[6]) or ask(*given))
+    play_plans(replace(plan_task("highway-fast-v0", "idle", 0, 9, 2), hidden_draws=3))
+    assert handed and set(handed) == {3}
+
+
 def test_whoever_knows_the_drivers_has_risks_and_no_errors():
     """Nothing is hidden on that road but the driver of the ego, whom plans replace."""
     world = slow_ahead()

@@ -172,3 +172,11 @@ def test_what_has_no_plans_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(plan_run, "play_plans", lambda task: [])
     with pytest.raises(UserError, match="add --episodes"):
         measure_plans(run())
+
+
+def test_whoever_is_asked_of_a_later_moment_alone_is_scored(monkeypatch: pytest.MonkeyPatch):
+    later = found(1, [True, False, False, False, False], [0.8, 0.2, 0.2, 0.2, 0.2])
+    later.risk["drivers known"] = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    first = found(0, [False] * 5, [0.0] * 5)
+    monkeypatch.setattr(plan_run, "track", lambda *_, **__: [[first], [later]])
+    assert list(measure_plans(run()).scores) == ["model", "drivers known"]
